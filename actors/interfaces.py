@@ -45,6 +45,10 @@ class NotPouredError(LaboratoryError):
     """
 
 
+class LinkLostError(NotPouredError):
+    """As stated, on a virtual bench: the connection to one of its devices was lost. A restarted bench can repeat it."""
+
+
 class UnknownPourError(LaboratoryError):
     """A pour began and did not end as planned. A person has to state its outcome; software never repeats the pour.
 
@@ -342,6 +346,19 @@ class Telling(Protocol):
 
         Args:
             hear: called in the event loop; must not raise.
+        """
+        ...
+
+
+@runtime_checkable
+class Restartable(Protocol):
+    """A laboratory whose virtual bench can be restarted after the connection to one of its devices was lost."""
+
+    async def restart_bench(self) -> None:
+        """End the devices of the bench and their emulators, and start new ones.
+
+        Raises:
+            LaboratoryError: they do not start.
         """
         ...
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -239,6 +239,7 @@ class _OpenLaboratory:
         self._devices: list[Device] = []
         self._opened: OpenBench | None = None
         self._bench_problem: str | None = None
+        self._open_again: Callable[[], Awaitable[None]] | None = None
         self._notices: list[Notice] = []
         self._subscriber: Callable[[Notice], None] = self._notices.append
 
@@ -302,8 +303,20 @@ class _OpenLaboratory:
         return DeviceOptimizer(proposer)
 
     async def _open_bench(self, make: MakeDevice, liquid: SimulatorPool | None) -> None:
+        self._open_again = partial(self._open_bench, make, liquid)
         self._opened = await open_bench(self._spec, make, liquid, self._operator, self._report, self._record)
         self._devices += self._opened.devices
+
+    async def restart_bench(self) -> None:
+        """See `Restartable.restart_bench`."""
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            self._devices = [device for device in self._devices if device not in opened.devices]
+            with contextlib.suppress(LaboratoryError):
+                await opened.close()
+            await asyncio.gather(*(device.close() for device in opened.devices), return_exceptions=True)
+        if self._open_again is not None:
+            await self._open_again()
 
     async def _close_all(self) -> None:
         opened, self._opened = self._opened, None

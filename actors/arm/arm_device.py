@@ -13,6 +13,7 @@ from actors.arm.arm_interface import ArmError, ArmFacts, ArmState, Executed, Pla
 from actors.arm.arm_settings import ArmSettings
 from actors.arm.planned_pour import PlaceWay
 from actors.interfaces import LaboratoryError
+from actors.runtime.bench_clock import device_clock
 from actors.runtime.remote_object import Device, DeviceLostError
 
 CALL_TIMEOUT = 60.0
@@ -47,23 +48,26 @@ class DeviceArm:
 
     def __init__(self, device: Device, spec: ArmSettings) -> None:
         self.device, self._spec = device, spec
+        self._patience = device_clock(spec.clock).patience
 
     async def ready(self) -> ArmFacts:
         """Connect and return the arm's facts; nothing moves."""
         await self.device.revive()
         try:
-            facts: ArmFacts = await self.device.call("facts", deadline=CALL_TIMEOUT)
+            facts: ArmFacts = await self.device.call("facts", deadline=self._patience * CALL_TIMEOUT)
         except ArmError:
-            facts = await self.device.call("connect", deadline=CALL_TIMEOUT)
+            facts = await self.device.call("connect", deadline=self._patience * CALL_TIMEOUT)
         return facts
 
     async def hands_in(self) -> None:
         """Make sure that no program runs on the controller and that the arm stands still, and read both back."""
-        await self.device.call("hands_in", deadline=CALL_TIMEOUT)
+        await self.device.call("hands_in", deadline=self._patience * CALL_TIMEOUT)
 
     async def release(self, *, warned: bool = False) -> None:
         """Allow the arm to move, after an operator's consent; `warned`: at once (arms that carry vessels)."""
-        await self.device.call("release", *([True] if warned else []), deadline=CALL_TIMEOUT, urgent=True)
+        await self.device.call(
+            "release", *([True] if warned else []), deadline=self._patience * CALL_TIMEOUT, urgent=True
+        )
 
     async def move_to_start(self, path: PlannedPour, follow: Follow = _ignore) -> None:
         """Move from home to the pour's start. `follow` is called periodically with the arm's state."""
@@ -89,7 +93,7 @@ class DeviceArm:
 
     async def drive(self, speed: float) -> ArmState:
         """Set the speed of the tilt in a running dose [rad/s]. Returns the state."""
-        state: ArmState = await self.device.call("drive", speed, deadline=DRIVE_TIMEOUT, urgent=True)
+        state: ArmState = await self.device.call("drive", speed, deadline=self._patience * DRIVE_TIMEOUT, urgent=True)
         return state
 
     async def retreat(self, path: PlannedPour | PlaceWay, follow: Follow = _ignore) -> None:
@@ -122,25 +126,25 @@ class DeviceArm:
 
     async def stop(self) -> None:
         """Stop any motion; the arm stays locked."""
-        await self.device.call("stop", deadline=CALL_TIMEOUT, urgent=True)
+        await self.device.call("stop", deadline=self._patience * CALL_TIMEOUT, urgent=True)
 
     async def state(self) -> ArmState:
         """The arm's present state."""
-        state: ArmState = await self.device.call("state", deadline=CALL_TIMEOUT, urgent=True)
+        state: ArmState = await self.device.call("state", deadline=self._patience * CALL_TIMEOUT, urgent=True)
         return state
 
     async def pace(self, time_scale: float) -> None:
         """Set the controller seconds per second of the clock; emulated UR arms only."""
         self._spec = self._spec.with_values(time_scale=time_scale)
-        await self.device.call("pace", time_scale, deadline=CALL_TIMEOUT, urgent=True)
+        await self.device.call("pace", time_scale, deadline=self._patience * CALL_TIMEOUT, urgent=True)
 
     async def close(self) -> None:
         """Disconnect from the controller."""
-        await self.device.call("close", deadline=CALL_TIMEOUT)
+        await self.device.call("close", deadline=self._patience * CALL_TIMEOUT)
 
     def _deadline(self, seconds: float) -> float:
         """The deadline for an action of this duration on the controller [s]: twice as long, to detect a lost arm."""
-        return CALL_TIMEOUT + 2.0 * self._spec.on_clock(seconds)
+        return self._patience * (CALL_TIMEOUT + 2.0 * self._spec.on_clock(seconds))
 
     @contextlib.asynccontextmanager
     async def _followed(self, follow: Follow) -> AsyncIterator[None]:

@@ -109,6 +109,9 @@ class ArmSettings(Settings):
     time_scale: Annotated[float, SET_BY_PROGRAM] = 1.0
     """Bench seconds per second of the clock; 1 for hardware, 0 to skip all waits."""
 
+    clock: Annotated[str, SET_BY_PROGRAM] = ""
+    """File of the clock that the devices of a virtual bench share (`actors.runtime.bench_clock`); '' on hardware."""
+
     warning_time: Annotated[float, SET_BY_PROGRAM] = 0.0
     """Time from the operator's consent to the first movement [s]."""
 

@@ -21,16 +21,19 @@ class DeviceBalance:
         device: holds the driver.
         time_scale: bench seconds per wall second, for deadlines; 0 disables waiting.
         longest_call: wall time limit of the driver's calls [s], see `BalanceSettings.longest_call`.
+        patience: factor of all deadlines, see `DeviceClock`.
     """
 
-    def __init__(self, device: Device, time_scale: float = 1.0, *, longest_call: float = 0.0) -> None:
+    def __init__(
+        self, device: Device, time_scale: float = 1.0, *, longest_call: float = 0.0, patience: float = 1.0
+    ) -> None:
         self.device = device
         self._scale = time_scale
-        self._longest_call = longest_call
+        self._longest_call, self._patience = longest_call, patience
 
     def _deadline(self, bench_time: float) -> float:
         passing = 2.0 * bench_time / self._scale if self._scale > 0.0 else 0.0
-        return ANSWER_DEADLINE + max(self._longest_call, passing)
+        return self._patience * (ANSWER_DEADLINE + max(self._longest_call, passing))
 
     async def tare(self) -> None:
         """See `BalanceDriver.tare`."""
@@ -43,7 +46,7 @@ class DeviceBalance:
 
     async def read(self) -> Weight:
         """See `BalanceDriver.read`."""
-        weight: Weight = await self.device.call("read", deadline=ANSWER_DEADLINE, urgent=True)
+        weight: Weight = await self.device.call("read", deadline=self._patience * ANSWER_DEADLINE, urgent=True)
         return weight
 
     async def stream(self, interval: float = 0.1) -> AsyncIterator[Weight]:
@@ -67,33 +70,35 @@ class DeviceBalance:
 
     async def keep_reference(self) -> None:
         """See `BalanceDriver.keep_reference`."""
-        await self.device.call("keep_reference", deadline=ANSWER_DEADLINE, urgent=True)
+        await self.device.call("keep_reference", deadline=self._patience * ANSWER_DEADLINE, urgent=True)
 
     async def statistics(self) -> dict[str, int]:
         """Return the counters of the serial line; serial balances only."""
-        counts: dict[str, int] = await self.device.call("statistics", deadline=ANSWER_DEADLINE, urgent=True)
+        counts: dict[str, int] = await self.device.call(
+            "statistics", deadline=self._patience * ANSWER_DEADLINE, urgent=True
+        )
         return counts
 
     async def pace(self, time_scale: float) -> None:
         """Set the bench seconds per second of the clock; emulated serial balances only."""
         self._scale = time_scale
-        await self.device.call("pace", time_scale, deadline=ANSWER_DEADLINE, urgent=True)
+        await self.device.call("pace", time_scale, deadline=self._patience * ANSWER_DEADLINE, urgent=True)
 
     async def resume(self) -> None:
         """See `BalanceDriver.resume`."""
-        await self.device.call("resume", deadline=ANSWER_DEADLINE, urgent=True)
+        await self.device.call("resume", deadline=self._patience * ANSWER_DEADLINE, urgent=True)
 
     async def release(self) -> None:
         """Close the driver."""
-        await self.device.call("close", deadline=ANSWER_DEADLINE)
+        await self.device.call("close", deadline=self._patience * ANSWER_DEADLINE)
 
     async def prepare(self, seed: tuple[int, ...]) -> None:
         """Empty the tray, set bench time to 0 and reseed the noise; simulated balances only."""
-        await self.device.call("prepare", seed, deadline=ANSWER_DEADLINE)
+        await self.device.call("prepare", seed, deadline=self._patience * ANSWER_DEADLINE)
 
     async def put(self, load: Load) -> None:
         """Set the load on the tray from now on; simulated balances only."""
-        await self.device.call("put", load, deadline=ANSWER_DEADLINE)
+        await self.device.call("put", load, deadline=self._patience * ANSWER_DEADLINE)
 
     async def pass_time(self, seconds: float) -> None:
         """Let bench time pass [s]; simulated balances only."""
@@ -101,4 +106,4 @@ class DeviceBalance:
 
     async def interrupt(self) -> None:
         """End the current wait."""
-        await self.device.call("interrupt", deadline=ANSWER_DEADLINE, urgent=True)
+        await self.device.call("interrupt", deadline=self._patience * ANSWER_DEADLINE, urgent=True)

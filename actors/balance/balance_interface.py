@@ -8,7 +8,6 @@ last reading of a display: its weight, its step, and its unit for lines without 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -24,7 +23,7 @@ class Weight:
     Attributes:
         mass: net of the tare [kg]; nan if the display shows none (`read` only).
         stable: whether the balance reports it as stable; only stable weights count as measurements.
-        time: of the reading [s]: bench time for a simulated balance in this process, `time.monotonic` for a serial
+        time: of the reading [s]: bench time for a simulated balance in this process, `DeviceClock` for a serial
             balance.
         status: 'stable', 'unstable', 'over range', 'under range', 'busy', 'error', 'silent', 'not understood' or
             'lost'.
@@ -234,9 +233,9 @@ class BalanceDisplay:
             shown or (self.last.shown if reading.status in _WITHOUT_LINE else str(reading)),
         )
 
-    def lose(self) -> None:
-        """Record the loss of the connection; the last shown text is kept for messages."""
-        self.last = Weight(math.nan, False, time.monotonic(), str(ReadingStatus.LOST), self.step, self.last.shown)
+    def lose(self, moment: float) -> None:
+        """Record the loss of the connection at a time [s]; the last shown text is kept for messages."""
+        self.last = Weight(math.nan, False, moment, str(ReadingStatus.LOST), self.step, self.last.shown)
 
     def in_grams(self, mass: float) -> str:
         """Format a mass with the display's digits.

@@ -199,6 +199,9 @@ class BalanceSettings(Settings):
     time_scale: Annotated[float, SET_BY_PROGRAM] = 1.0
     """Bench seconds per second of the clock; 1 for a real device, 0 disables waiting."""
 
+    clock: Annotated[str, SET_BY_PROGRAM] = ""
+    """File of the clock that the devices of a virtual bench share (`actors.runtime.bench_clock`); '' on hardware."""
+
     def check_laboratory(self, problems: Problems, *, mode: str) -> None:
         """Add a problem for each combination of values that is invalid in a laboratory.
 

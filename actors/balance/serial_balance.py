@@ -50,6 +50,7 @@ from actors.balance.readings import (
     WeightMark,
 )
 from actors.balance.serial_port import Counters, PortLostError, Tap, Wire
+from actors.runtime.bench_clock import device_clock
 
 _REOPEN_INTERVAL = 0.2
 _GLANCE = 0.1
@@ -66,7 +67,7 @@ class Conversation:
 
     def __init__(self, spec: SerialBalanceSettings, interrupted: threading.Event, tap: Tap | None = None) -> None:
         self._spec, self._interrupted, self._tap = spec, interrupted, tap
-        self.counters, self.time_scale = Counters(), spec.time_scale
+        self.counters, self.time_scale, self.clock = Counters(), spec.time_scale, device_clock(spec.clock)
         self.found: Detected | None = None
         """The detected balance; kept when the port vanishes."""
         self.refused: bytes | None = None
@@ -112,14 +113,14 @@ class Conversation:
                 allowed,
                 self._open_wire,
                 self._interrupted.is_set,
-                answer_time=self._spec.answer_time,
+                answer_time=self._spec.answer_time * self.clock.patience,
             )
 
     def reopen(self, deadline: float) -> None:
         """Wait for a vanished port to return.
 
         Args:
-            deadline: of `time.monotonic`.
+            deadline: of the clock.
 
         Raises:
             NoConnectionError: it did not return before the deadline, or the wait was interrupted.
@@ -128,7 +129,7 @@ class Conversation:
             try:
                 return self.open()
             except NoConnectionError:
-                if time.monotonic() + _REOPEN_INTERVAL > deadline or self._interrupted.wait(_REOPEN_INTERVAL):
+                if self.clock.now + _REOPEN_INTERVAL > deadline or self._interrupted.wait(_REOPEN_INTERVAL):
                     raise
 
     def close(self) -> None:
@@ -141,7 +142,7 @@ class Conversation:
         """Request the display's current weight.
 
         Returns:
-            The reading and its time [s of `time.monotonic`]. Its status is 'silent' if nothing came, and 'not
+            The reading and its time [s of the clock]. Its status is 'silent' if nothing came, and 'not
             understood' if lines came, but none with the weight that the settings name.
 
         Raises:
@@ -150,27 +151,27 @@ class Conversation:
         self.refused = None
         with self._wire_at_rest() as wire:
             wire.send(self.dialect.query)
-            end = time.monotonic() + self._spec.answer_time
+            end = self.clock.now + self._spec.answer_time
             held: tuple[Reading, float] | None = None
             while (line := self._line(wire, end)) is not None:
                 reply = self._decoded(line)
                 if isinstance(reply, Reading) and reply.mark in (None, self._spec.weight):
-                    return reply, time.monotonic()
+                    return reply, self.clock.now
                 if isinstance(reply, Reading):
                     if self._spec.weight == "gross":
                         self.refused = line
                     elif held is None:  # without a tare, gross is net; a balance that sends both sends net soon
-                        held = reply, time.monotonic()
+                        held = reply, self.clock.now
                         end = min(end, max(self._asked_at + self.interval, held[1]))
                     continue
                 if isinstance(reply, Acknowledgement) and not reply.command and reply.answer is ReadingReply.REFUSED:
-                    return Reading(ReadingStatus.BUSY, detail=f"{REFUSED}: {reply.text}"), time.monotonic()
+                    return Reading(ReadingStatus.BUSY, detail=f"{REFUSED}: {reply.text}"), self.clock.now
         if held is not None:
             return held
         self.counters.unanswered += 1
         if self.refused is None:
-            return Reading(ReadingStatus.SILENT), time.monotonic()
-        return Reading(ReadingStatus.UNREADABLE, detail=self._explained(self.refused)), time.monotonic()
+            return Reading(ReadingStatus.SILENT), self.clock.now
+        return Reading(ReadingStatus.UNREADABLE, detail=self._explained(self.refused)), self.clock.now
 
     def command(self, data: bytes, timeout: float) -> Acknowledgement | None:
         """Send tare or zero, and wait for the reply if the dialect has one.
@@ -192,7 +193,7 @@ class Conversation:
                 return None
             wanted = data.strip().decode("ascii")
             wait = max(timeout, self._spec.answer_time) if self.dialect.acknowledged else self._spec.answer_time
-            end = time.monotonic() + wait
+            end = self.clock.now + wait
             while (line := self._line(wire, end)) is not None:
                 reply = self._decoded(line)
                 if (
@@ -213,7 +214,7 @@ class Conversation:
             NoConnectionError: the port vanished.
         """
         with self._wire_at_rest() as wire:
-            end = time.monotonic() + seconds
+            end = self.clock.now + seconds
             while (line := self._line(wire, end)) is not None:
                 self._decoded(line)
 
@@ -222,10 +223,10 @@ class Conversation:
         """The open wire, with the query interval kept and no unread bytes; closed if it is lost in use."""
         self.open()
         assert self._wire is not None
-        wait = self._asked_at + self.interval - time.monotonic()
+        wait = self._asked_at + self.interval - self.clock.now
         if wait > 0.0:
             self._interrupted.wait(wait)
-        self._asked_at = time.monotonic()
+        self._asked_at = self.clock.now
         try:
             self._wire.flush()
             yield self._wire
@@ -236,9 +237,9 @@ class Conversation:
     def _line(self, wire: Wire, end: float) -> bytes | None:
         """Return the next line; checks for an interruption while waiting."""
         while not self._interrupted.is_set():
-            now = time.monotonic()
-            line = wire.line_until(min(end, now + _GLANCE))
-            if line is not None or now >= end:
+            left = end - self.clock.now
+            line = wire.line_until(time.monotonic() + min(left, _GLANCE))
+            if line is not None or left <= 0.0:
                 return line
         return None
 
@@ -314,6 +315,7 @@ class SerialBalance:
             source: Source = "hardware" if spec.virtual is None else "virtual"
             tap = Recorder.in_folder(Path(spec.raw_lines), name, source, spec.port)
         self._conversation = Conversation(spec, self._interrupted, tap)
+        self._clock = self._conversation.clock
         self._display = BalanceDisplay(spec.step)
         self._tared = self._reference_lost = False
         self._mark: WeightMark | None = None
@@ -373,7 +375,7 @@ class SerialBalance:
         """See `BalanceDriver.read`; returns the last reading while another call waits for a reply."""
         if self._lock.acquire(timeout=self._spec.answer_time / 4.0):
             try:
-                if time.monotonic() - self._display.last.time >= 0.9 * self._conversation.interval:
+                if self._clock.now - self._display.last.time >= 0.9 * self._conversation.interval:
                     self._read_once()
             finally:
                 self._lock.release()
@@ -448,9 +450,9 @@ class SerialBalance:
         if match is not None and match.commands and word not in match.commands:
             text = f"it has no {name}: the commands that it lists (I0) leave '{word}' out. Use its key"
             raise self._error(CommandError, text)
-        answer, end = "", time.monotonic() + 2.0 * self._rule.deadline
+        answer, end = "", self._clock.now + 2.0 * self._rule.deadline
         for _ in range(COMMAND_ATTEMPTS):
-            if time.monotonic() > end:
+            if self._clock.now > end:
                 break
             self._settle()
             answer = self._send(name, data)
@@ -497,27 +499,27 @@ class SerialBalance:
 
     def _near_zero(self) -> Settled | None:
         """Return None once the display settles near zero; after the time limit, return the settled weight."""
-        end = time.monotonic() + COMMAND_TIME / self._spec.time_scale
+        end = self._clock.now + COMMAND_TIME / self._spec.time_scale
         while True:
             settled = self._settle()
             if abs(settled.mass) <= ZERO_STEPS * self._display.step * (1 + 1e-9) + 3.0 * self._spec.repeatability:
                 return None
-            if time.monotonic() > end:
+            if self._clock.now > end:
                 return settled
 
     def _settle(self, *, reference_needed: bool = False) -> Settled:
         """Send queries until the weight has settled."""
         settling = Settling(self._rule)
-        deadline = time.monotonic() + self._rule.deadline
+        deadline = self._clock.now + self._rule.deadline
         outside_since: float | None = None
         seen, masses = Reading(ReadingStatus.SILENT), deque[float](maxlen=9)
-        while time.monotonic() < deadline:
+        while self._clock.now < deadline:
             self._check_interrupted()
             if reference_needed:
                 self._check_reference()
             exchanged = self._exchange()
             if exchanged is None:  # reconnected
-                deadline, settling = time.monotonic() + self._rule.deadline, Settling(self._rule)
+                deadline, settling = self._clock.now + self._rule.deadline, Settling(self._rule)
                 continue
             reading, moment = exchanged
             seen = reading if reading.status is not ReadingStatus.SILENT else seen
@@ -574,7 +576,7 @@ class SerialBalance:
 
     def _note_loss(self) -> None:
         self._reference_lost = self._reference_lost or self._tared
-        self._display.lose()
+        self._display.lose(self._clock.now)
 
     def _open(self) -> None:
         """Open the port for the first time; a port that is missing then is not waited for."""
@@ -597,7 +599,7 @@ class SerialBalance:
             raise self._error(NoConnectionError, f"its connection comes and goes ({error}); look at cable and plug")
         try:
             with self._exclusive():
-                self._conversation.reopen(time.monotonic() + self._spec.reconnect_time)
+                self._conversation.reopen(self._clock.now + self._spec.reconnect_time)
         except NoConnectionError as gone:
             self._check_interrupted()
             raise self._connection_error(gone) from gone
@@ -659,7 +661,7 @@ class SerialBalance:
     @contextlib.contextmanager
     def _exclusive(self) -> Iterator[None]:
         """Hold the line for one query or command."""
-        if not self._lock.acquire(timeout=self._rule.deadline + self._spec.reconnect_time):
+        if not self._lock.acquire(timeout=(self._rule.deadline + self._spec.reconnect_time) * self._clock.patience):
             raise self._error(BalanceError, "another call has not ended in time")
         try:
             yield

@@ -141,9 +141,9 @@ class Wire:
                 line = bytes(self._buffer[:end])
                 del self._buffer[: end + 1]
                 return line.rstrip(b"\r")  # also CR CR LF, as some printers and serial servers send
-            if moment <= time.monotonic():
+            ends = moment <= time.monotonic()  # then only with what has come: this process may be late
+            if not self._pull(only_waiting=ends) and ends:
                 return None
-            self._pull()
 
     @property
     def waiting(self) -> bool:

@@ -49,6 +49,7 @@ from actors.interfaces import (
 from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from actors.liquid_devices import SourceSettings, SpillSensorSettings
 from actors.places import Layout, PlaceRecord, all_places
+from actors.runtime.bench_clock import device_clock
 from actors.runtime.remote_object import Device
 from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement
@@ -224,7 +225,10 @@ class _Opening:
 
     def balance(self, spec: BalanceSettings, name: str, device: str = "balance") -> DeviceBalance:
         cls, args = balance_kind(spec).driver(name)
-        return DeviceBalance(self(device, cls, *args), spec.time_scale, longest_call=spec.longest_call)
+        patience = device_clock(spec.clock).patience
+        return DeviceBalance(
+            self(device, cls, *args), spec.time_scale, longest_call=spec.longest_call, patience=patience
+        )
 
     def held(
         self,

@@ -184,6 +184,7 @@ class Consent:
             LaboratoryError: this cannot be verified, and the operator ends the attempts.
         """
         problem = ""
+        lost: Exception | None = None
         while True:
             try:
                 if problem:
@@ -193,12 +194,13 @@ class Consent:
             except BenchLostError:
                 raise
             except STUCK as error:
+                lost = error
                 if not problem:
                     problem = str(error)  # the connection may recover without the operator
                     continue
                 problem = str(error)
             if not await self._agreed(unsafe_question(problem)):
-                raise LaboratoryError(f"it can't be seen that the arm keeps still: {problem}")
+                raise LaboratoryError(f"it can't be seen that the arm keeps still: {problem}") from lost
 
     async def _agreed(self, question: OperatorQuestion) -> bool:
         return (await self.ask(question)).strip().lower() in ("yes", "y")
@@ -286,7 +288,7 @@ class Consent:
                 continue
             self._setup.tell(Notice("info", f"the arm is ready again: {done or 'nothing had to be done'}"))
             return
-        raise LaboratoryError(f"{error}; the operator leaves the arm as it stands")
+        raise LaboratoryError(f"{error}; the operator leaves the arm as it stands") from error
 
     async def leave_safe(self) -> None:
         """Stop arm and balance after any failure, also while this task is being cancelled."""

@@ -19,7 +19,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -51,6 +50,9 @@ from sim_engine.scene import Scene
 
 TICK = 0.05
 """Time between two decisions [s]."""
+
+LATEST_COMMAND = 0.12
+"""Time from one command to the next one [s of the clock], for which the clock of a virtual bench waits."""
 
 LOOK_INTERVAL = 0.01
 """Pause between two readings of the balance [s of the clock]."""
@@ -291,7 +293,7 @@ class DoseProcedure(BenchProcedure):
     async def _controlled(self) -> DoseResult:
         """The control loop: ends when the controller has a result, or the motion has been stopped."""
         assert self._series is not None
-        arm, dose = self._setup.arm, self._dose
+        arm, dose, clock = self._setup.arm, self._dose, self._setup.ground_truth.clock
         order = DoseOrder(dose.amount, dose.limit, receiver_mass=self._zero)
         controller = self._series.controller(order, seed=self._seed)
         longest = self._settings.time_limit + CLOSING_TIME
@@ -311,10 +313,13 @@ class DoseProcedure(BenchProcedure):
                 self._tilts.append((now - begin, tilt))
                 command = controller.step(now, tilt, self._readings.fresh())
                 state = await arm.drive(command.speed)
+                clock.promise("dose", LATEST_COMMAND)
                 self._show(controller, state, tilt)
                 await self._sleep(max(now + TICK - self._now(), 0.0))
+            clock.withdraw("dose")
             self._executed = await motion  # without commands the cup turns back, and the program ends
         finally:
+            clock.withdraw("dose")
             if not motion.done():
                 with contextlib.suppress(Exception):
                     async with asyncio.timeout(1.0):
@@ -328,7 +333,7 @@ class DoseProcedure(BenchProcedure):
 
     def _now(self) -> float:
         """The clock in bench time [s], as it passes in a dose."""
-        return self._scale * time.monotonic()
+        return self._scale * self._setup.ground_truth.clock.now
 
     async def _sleep(self, seconds: float) -> None:
         await asyncio.sleep(seconds / self._scale)

@@ -21,10 +21,14 @@ import numpy as np
 from actors.arm.ur_settings import UrArmSettings
 from actors.dosing.virtual_dosing_bench import LONGEST_DOSE, TIME_STEP, LivePour, TrueCup, TrueScale, VirtualDosingBench
 from actors.interfaces import LaboratoryError
+from actors.runtime.bench_clock import device_clock
 from sim_engine.liquids import Liquid
 
 INTERVAL = 0.02
 """Time between two readings of the arm [s]."""
+
+LATEST = 0.08
+"""Time from one reading to the next one [s of the clock], for which the clock of the bench waits."""
 
 SILENCE = 30.0
 """Time without an answer of the arm's emulator after which nothing flows any more [s]: the emulator has ended."""
@@ -149,16 +153,20 @@ class FlowingLiquid:
         )
 
     def _run(self) -> None:
-        answered = time.monotonic()
-        while not self._ending.wait(INTERVAL):
-            try:
-                self._follow()
-                answered = time.monotonic()
-            except LaboratoryError:  # a single lost answer is made up for by the next one
-                if time.monotonic() - answered > SILENCE:
+        answered, clock = time.monotonic(), device_clock(self._arm.clock)
+        try:
+            while not self._ending.wait(INTERVAL):
+                try:
+                    self._follow()
+                    answered = time.monotonic()
+                except LaboratoryError:  # a single lost answer is made up for by the next one
+                    if time.monotonic() - answered > SILENCE:
+                        return
+                clock.promise("liquid", LATEST)
+                if self._clock - self._begun > 20.0 * LONGEST_DOSE:
                     return
-            if self._clock - self._begun > 20.0 * LONGEST_DOSE:
-                return
+        finally:
+            clock.withdraw("liquid")
 
     def _follow(self) -> None:
         """Pour along the motion since the last call."""

@@ -20,6 +20,7 @@ from actors.arm.arm_interface import Executed, PlannedPour
 from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseTarget, InvalidActionError, LaboratoryError, ProgressCallback, SimulatorPool
 from actors.laboratory_settings import BenchSettings
+from actors.runtime.bench_clock import DeviceClock
 from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement, PourOutcome, RecordedFrames, SimulatedPour
 from sim_engine.scene import PoseError, PourTask, Scene
@@ -193,10 +194,14 @@ class GroundTruth:
 
     Args:
         time_scale: bench seconds per second of the clock.
+
+    Attributes:
+        clock: of the devices.
     """
 
     def __init__(self, time_scale: float) -> None:
         self._time_scale = time_scale
+        self.clock = DeviceClock()
 
     async def prepare(self, pour: PourAsk) -> None:
         """Called before the operator prepares the pour."""
@@ -262,6 +267,10 @@ class GroundTruth:
         """Context in which the clock of a virtual bench runs at most `FASTEST_DOSE` times as fast as a real one."""
         yield
 
+    async def untouched(self) -> bool:
+        """Whether it is certain that the pourer was not tilted in this pour; only an emulated arm can tell."""
+        return False
+
     async def flows(self) -> None:
         """Called when the arm is about to tilt for a dose: from now on the liquid follows its motion."""
 
@@ -275,7 +284,9 @@ class GroundTruth:
 
     async def wait(self, seconds: float) -> None:
         """Let bench time pass [s]."""
-        await asyncio.sleep(seconds / self._time_scale)
+        end = self.clock.now + seconds / self._time_scale
+        while (left := end - self.clock.now) > 0.0:
+            await asyncio.sleep(left)
 
     async def settle(self, seconds: float) -> None:
         """Wait at least `seconds` of bench time, so that the last drops fall."""

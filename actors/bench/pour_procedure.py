@@ -13,7 +13,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-import time
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Mapping
 from typing import Any
@@ -29,7 +28,7 @@ from actors.arm.arm_interface import (
     Executed,
     PlannedPour,
 )
-from actors.balance.balance_interface import BalanceError
+from actors.balance.balance_interface import BalanceError, NoConnectionError
 from actors.balance.weighing import Weighings
 from actors.balance.weighing_plan import Placement, PourMasses
 from actors.bench.consent import Consent, Setup, grams, start_question
@@ -40,6 +39,7 @@ from actors.interfaces import (
     DoseProgress,
     InvalidActionError,
     LaboratoryError,
+    LinkLostError,
     Notice,
     NotPouredError,
     PourFailedError,
@@ -161,6 +161,7 @@ class BalanceReadings:
 
     def __init__(self, setup: Setup, report: PourReport, interval: float, scale: float) -> None:
         self._balance, self._report, self._interval, self._scale = setup.balance, report, interval, scale
+        self._clock = setup.ground_truth.clock
         self._kept: list[DoseReading] = []
         self._taken = 0
         self.step = 0.0
@@ -183,7 +184,7 @@ class BalanceReadings:
 
     @property
     def all(self) -> tuple[DoseReading, ...]:
-        """All readings so far; their times are `time.monotonic` in bench time."""
+        """All readings so far; their times are those of the devices' clock in bench time."""
         return tuple(self._kept)
 
     async def _read(self) -> None:
@@ -195,7 +196,7 @@ class BalanceReadings:
                 if math.isfinite(weight.mass):
                     self._report.show(weight.mass, weight.stable)
                     if weight.status in ("stable", "unstable") and weight.time > last:
-                        last, now = weight.time, time.monotonic()
+                        last, now = weight.time, self._clock.now
                         # the driver's clock is this one, unless it runs on another machine
                         moment = weight.time if 0.0 <= now - weight.time < 1.0 else now
                         self.step = weight.step or self.step
@@ -242,6 +243,7 @@ class BenchProcedure(ABC):
 
         Raises:
             NotPouredError: nothing was poured.
+            LinkLostError: likewise, since a connection was lost on a virtual bench.
             UnknownPourError: some liquid may have been poured.
         """
         setup = self._setup
@@ -261,7 +263,10 @@ class BenchProcedure(ABC):
         except LaboratoryError as error:
             self._begun = self._begun or (self._moves and setup.lost)
             text = f"{error}. {await self._unknown(error) if self._begun else 'Nothing was poured'}"
+            untouched = not self._begun or await setup.ground_truth.untouched()
             await self._consent.leave_safe()
+            if setup.mode == "virtual" and untouched and _is_lost_link(error):
+                raise LinkLostError(text) from error
             raise (UnknownPourError if self._begun else NotPouredError)(text) from error
         finally:
             await setup.ground_truth.end()
@@ -305,6 +310,16 @@ LOOK_INTERVAL = 0.1
 
 BEFORE_TILT = 1.0
 """Readings are recorded from so long before the first tilt on [s]."""
+
+
+def _is_lost_link(error: BaseException | None) -> bool:
+    """Whether an error or its cause is a lost connection."""
+    while error is not None:
+        if isinstance(error, ArmLostError | DeviceLostError | NoConnectionError):
+            return True
+        error = error.__cause__
+    return False
+
 
 _BROKEN_OFF = (ArmStoppedError, ArmLostError, DeviceLostError)
 
@@ -506,7 +521,7 @@ class PourProcedure(BenchProcedure):
 
     def _follow(self, state: ArmState) -> None:
         if state.tilt is not None and state.moving:
-            self._tilts.append((time.monotonic(), state.tilt))
+            self._tilts.append((self._setup.ground_truth.clock.now, state.tilt))
         self._report.move(state.phase, state.fraction, state.tilt, moving=state.moving)
         self._seen(state)
 

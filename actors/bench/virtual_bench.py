@@ -34,13 +34,14 @@ from actors.dosing.simulated_dose import true_cup
 from actors.grippers.gripper_interface import GripperEmulator, GripperSettings
 from actors.interfaces import DoseTarget, LaboratoryError, SimulatorPool
 from actors.laboratory_settings import BenchSettings
+from actors.runtime.bench_clock import PATIENCE, device_clock
 from actors.runtime.remote_object import Device
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseError, PourTask, SampledMotion, Scene
 
 FloatArray = NDArray[np.float64]
 
-DEADLINE = 30.0
+DEADLINE = 30.0 * PATIENCE
 """Longest wait for any reply of the emulators [s]; their process may still be starting."""
 
 AT_START = 2e-3
@@ -105,6 +106,8 @@ class BenchEmulators:
         try:
             if gripper is not None:
                 self._gripper = gripper.beside(arm if self._arm is None else self._arm.arm).start_emulator()
+            if balance is not None and self._arm is not None:
+                balance = self._weighs = balance.with_values(clock=self._arm.arm.clock)
             self._balance = None if balance is None or balance.typed else balance_kind(balance).start_emulator()
         except BaseException:
             self.close()
@@ -356,6 +359,7 @@ class VirtualBench(GroundTruth):
         self.emulators, self.contents, self._hands = emulators, hands.contents, hands
         self._pour: PourAsk | None = None
         self._landed = False
+        self._left: bool | None = None  # whether liquid may have left the pourer; None before it is known
 
     async def prepare(self, pour: PourAsk) -> None:
         """See `GroundTruth.prepare`."""
@@ -407,7 +411,7 @@ class VirtualBench(GroundTruth):
             return
         error = draw_pose_error(self._spec, self._pour.seed)
         motion = self._motion(executed, error.tilt)
-        self._landed = True
+        self._landed, self._left = True, motion is not None
         if motion is not None:
             spilled, retained = await self._simulate(self._pour, motion, error)
             self.contents.receive(spilled, retained)
@@ -454,6 +458,7 @@ class FollowedBench(VirtualBench):
     ) -> None:
         super().__init__(spec, arm.time_scale, emulators, hands, simulators)
         self._arm, self._paced = arm, (emulators, *drivers)
+        self.clock = device_clock(arm.clock)
         self._noting = asyncio.Lock()
         self._times: list[float] = []
         self._joints: list[tuple[float, ...]] = []
@@ -465,7 +470,7 @@ class FollowedBench(VirtualBench):
     @contextlib.asynccontextmanager
     async def followed(self) -> AsyncIterator[None]:
         """See `GroundTruth.followed`; reads the arm's history at regular intervals, however long the operator takes."""
-        self._times, self._joints, self._landed, self._gap = [], [], False, ""
+        self._times, self._joints, self._landed, self._left, self._gap = [], [], False, None, ""
         self._earlier, self._since = 0.0, (await self.emulators.history(math.inf)).now
         following = asyncio.create_task(self._follow())
         try:
@@ -519,6 +524,16 @@ class FollowedBench(VirtualBench):
                 with contextlib.suppress(LaboratoryError):  # a driver that was lost starts with the bench's own clock
                     await device.pace(self._time_scale)
 
+    async def untouched(self) -> bool:
+        """See `GroundTruth.untouched`."""
+        with contextlib.suppress(LaboratoryError):
+            await self.flowed()
+            if self._left is None:
+                await self.note()
+                self._left = self._motion(None, 0.0) is not None
+            return not self._left
+        return False
+
     async def flows(self) -> None:
         """See `GroundTruth.flows`."""
         assert self._flow is not None
@@ -532,7 +547,9 @@ class FollowedBench(VirtualBench):
         if not self._flowing:
             return {}
         self._flowing = False
+        self._left = True  # unless the emulators report otherwise
         end = await self.emulators.flowed()
+        self._left = end.tilt > UPRIGHT or end.received + end.spilled > 0.0
         self.contents.receive(end.spilled, end.left)
         return {"true": end.received, "upright": end.upright}
 

@@ -22,6 +22,7 @@ from actors.grippers.onrobot_gripper import MODELS as ONROBOT_MODELS
 from actors.grippers.onrobot_gripper import OnRobotSettings
 from actors.grippers.robotiq_gripper import ARRIVED as ARRIVED_OBJ
 from actors.grippers.robotiq_gripper import CLOSING_STOPPED, MOVING, READY, RESET, RobotiqSettings
+from actors.runtime.bench_clock import device_clock
 
 LOOPBACK = "127.0.0.1"
 
@@ -50,6 +51,7 @@ class Fingers:
     Args:
         closed, widest: their smallest and largest width [m].
         time_scale: gripper seconds per second of the clock.
+        clock: file of the bench's clock; '' for the wall clock.
 
     Attributes:
         object: width of the object [m]; None if there is none.
@@ -60,9 +62,10 @@ class Fingers:
         delay: time before each answer [s of the clock].
     """
 
-    def __init__(self, closed: float, widest: float, time_scale: float) -> None:
+    def __init__(self, closed: float, widest: float, time_scale: float, clock: str = "") -> None:
         self.closed, self.widest = closed, widest
         self._scale = time_scale if time_scale > 0.0 else 1e3
+        self._clock = device_clock(clock)
         self.object: float | None = None
         self.absent = self.crooked = self.weak = False
         self.powered = True
@@ -73,7 +76,7 @@ class Fingers:
     @property
     def now(self) -> float:
         """Gripper time [s]."""
-        return self._scale * time.monotonic()
+        return self._scale * self._clock.now
 
     def put(self, width: float | None) -> None:
         """See `GripperEmulator.put`."""
@@ -155,7 +158,7 @@ class RobotiqEmulator:
 
     def __init__(self, settings: RobotiqSettings) -> None:
         self._settings = settings
-        self.fingers = Fingers(0.0, settings.widest, settings.time_scale)
+        self.fingers = Fingers(0.0, settings.widest, settings.time_scale, settings.clock)
         self._lock = threading.Lock()
         self._values = {"ACT": 0, "GTO": 0, "ATR": 0, "ARD": 0, "FOR": 0, "SPE": 0, "POS": 0, "MOD": 0}
         self._fault, self._activated = 0, 0.0
@@ -264,7 +267,7 @@ class OnRobotEmulator:
         self._settings, self._model = settings, ONROBOT_MODELS[settings.model]
         self._two = self._model.prefix == "twofg"
         closed, widest = OUTWARD if self._two else (0.0, settings.widest)
-        self.fingers = Fingers(closed, widest, settings.time_scale)
+        self.fingers = Fingers(closed, widest, settings.time_scale, settings.clock)
         self._force, self._safety = 0.0, False
         self._server = _XmlServer(settings.address, settings.port, self._methods(), lambda: self.fingers.delay)
         self.gripper = settings.with_values(address=self._server.address, port=self._server.port)

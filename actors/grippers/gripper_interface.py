@@ -23,6 +23,7 @@ from pydantic import Field, Strict
 from actors.arm.arm_interface import ArmStoppedError
 from actors.arm.arm_settings import ArmSettings
 from actors.interfaces import LaboratoryError
+from actors.runtime.bench_clock import DeviceClock
 from sim_engine.settings.model import NOT_IN_FINGERPRINT, SET_BY_PROGRAM, Problems, Settings, Text
 from sim_engine.settings.plugin_registry import PluginRegistry, settings_kind
 from sim_engine.settings.quantity import Quantity
@@ -170,6 +171,9 @@ class GripperSettings(Settings):
     time_scale: Annotated[float, SET_BY_PROGRAM] = 1.0
     """Bench seconds per second of the clock."""
 
+    clock: Annotated[str, SET_BY_PROGRAM] = ""
+    """File of the clock that the devices of a virtual bench share (`actors.runtime.bench_clock`); '' on hardware."""
+
     @property
     @abstractmethod
     def widest(self) -> float:
@@ -194,10 +198,11 @@ class GripperSettings(Settings):
         return sum(self.forces) / 2.0 if self.force is None else self.force
 
     def beside(self, arm: ArmSettings | None) -> GripperSettings:
-        """The settings with the address and the time scale of an arm."""
+        """The settings with the address, the time scale and the clock of an arm."""
         if arm is None:
             return self
-        return self.with_values(address=self.address or getattr(arm, "address", ""), time_scale=arm.time_scale)
+        address = self.address or getattr(arm, "address", "")
+        return self.with_values(address=address, time_scale=arm.time_scale, clock=arm.clock)
 
     def check_values(self, problems: Problems) -> None:
         """See `Settings.check_values`."""
@@ -291,7 +296,9 @@ def opened(state: GripperState, width: float, accuracy: float, where: str) -> Gr
     return state
 
 
-def settled(read: Callable[[], GripperState], begin: float, end: float, same: int = 3) -> GripperState:
+def settled(
+    read: Callable[[], GripperState], begin: float, end: float, clock: DeviceClock, same: int = 3
+) -> GripperState:
     """Read a gripper until its fingers stand still.
 
     Right after a command a gripper still reports the state from before: an RG6 answered 'not busy' and the old width
@@ -299,15 +306,16 @@ def settled(read: Callable[[], GripperState], begin: float, end: float, same: in
 
     Args:
         read: reads the state.
-        begin: time for which the fingers may not have begun to move [s].
-        end: longest time of the motion [s].
+        begin: time for which the fingers may not have begun to move [s of the clock].
+        end: longest time of the motion [s of the clock].
+        clock: of the gripper.
         same: number of readings that must be equal.
 
     Raises:
         GripperError: they move for longer.
     """
-    started, last, count = time.monotonic(), None, 0
-    for elapsed in _ticks(started, end):
+    last, count = None, 0
+    for elapsed in _ticks(clock, end):
         state = read()
         count = count + 1 if state == last and not state.moving else 0
         last = state
@@ -316,7 +324,8 @@ def settled(read: Callable[[], GripperState], begin: float, end: float, same: in
     raise GripperError(f"the fingers have not come to rest within {end:g} s: {last}")
 
 
-def _ticks(started: float, end: float) -> Iterator[float]:
-    while (elapsed := time.monotonic() - started) <= end:
+def _ticks(clock: DeviceClock, end: float) -> Iterator[float]:
+    started = clock.now
+    while (elapsed := clock.now - started) <= end:
         yield elapsed
         time.sleep(REST)

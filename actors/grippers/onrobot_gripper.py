@@ -27,6 +27,7 @@ from actors.grippers.gripper_interface import (
     opened,
     settled,
 )
+from actors.runtime.bench_clock import device_clock
 from sim_engine.settings.model import NOT_IN_FINGERPRINT, Example, Problems
 from sim_engine.settings.quantity import Quantity
 
@@ -131,7 +132,8 @@ class OnRobotGripper:
         self._settings, self._model = settings, MODELS[settings.model]
         self._where = f"gripper {settings.model} at {settings.address}:{settings.port}"
         self._url = f"http://{settings.address}:{settings.port}/"
-        self._timeout = timeout
+        self._clock = device_clock(settings.clock)
+        self._timeout = timeout * self._clock.patience
         self._server = self._proxy()
         self._one_at_a_time = threading.Lock()  # a proxy has one connection, for one request at a time
 
@@ -235,7 +237,7 @@ class OnRobotGripper:
             reply = self._own("grip", float(max(millimetres, 0.0)), float(force))
         if reply not in (None, 0, True):
             raise GripperError(f"{self._where} does not grip: it answered {reply!r}")
-        return settled(self.state, REACTION / max(self._settings.time_scale, 1.0), TRAVEL)
+        return settled(self.state, REACTION / max(self._settings.time_scale, 1.0), TRAVEL, self._clock)
 
     def stop(self) -> None:
         """See `Gripper.stop`."""

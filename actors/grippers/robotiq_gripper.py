@@ -34,6 +34,7 @@ from actors.grippers.gripper_interface import (
     opened,
     settled,
 )
+from actors.runtime.bench_clock import device_clock
 from sim_engine.settings.model import NOT_IN_FINGERPRINT, Example, Problems
 from sim_engine.settings.quantity import Quantity
 
@@ -209,7 +210,8 @@ class RobotiqGripper:
     """
 
     def __init__(self, settings: RobotiqSettings, timeout: float = REPLY_TIMEOUT) -> None:
-        self._settings, self._timeout = settings, timeout
+        self._settings, self._clock = settings, device_clock(settings.clock)
+        self._timeout = timeout * self._clock.patience
         self._where = f"gripper {settings.model} at {settings.address}:{settings.port}"
         self._socket: socket.socket | None = None
         self._one_at_a_time = threading.Lock()
@@ -299,9 +301,9 @@ class RobotiqGripper:
         self._requested = None
 
     def _wait(self, name: str, value: int) -> None:
-        end = time.monotonic() + ACTIVATION
+        end = self._clock.now + ACTIVATION
         while (current := self.get(name)) != value:
-            if time.monotonic() > end:
+            if self._clock.now > end:
                 fault = FAULTS.get(self.get("FLT"), "")
                 raise GripperError(
                     f"{self._where} is not ready after {ACTIVATION:g} s ({name} {current}){fault and ': '}{fault}"
@@ -362,7 +364,7 @@ class RobotiqGripper:
                 )
             time.sleep(REST)
         self._requested = (position, force)
-        return settled(self.state, REACTION / max(self._settings.time_scale, 1.0), TRAVEL)
+        return settled(self.state, REACTION / max(self._settings.time_scale, 1.0), TRAVEL, self._clock)
 
     def stop(self) -> None:
         """See `Gripper.stop`; fingers that stand go on pressing."""

@@ -1,13 +1,22 @@
 """Bench time: the clock of a virtual bench, scaled against the wall clock.
 
-`Pace` converts bench time to wall time and waits. With a time scale of 0 it does not wait at all.
+- `Pace` converts bench time to wall time and waits. With a time scale of 0 it does not wait at all.
+- `DeviceClock` is the clock of devices and their drivers [s], which measures their time limits. On hardware it is the
+  wall clock. The devices of a virtual bench share one through a file, a `SharedClock`: the emulated controller advances
+  it, never faster than the wall clock, and slower if the host delays it. It does not advance beyond what the programs
+  have promised that must act in time, such as the one that writes a heartbeat.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
+import mmap
+import os
 import threading
 import time
+from array import array
+from pathlib import Path
 
 
 class Pace:
@@ -62,3 +71,125 @@ class Pace:
     def interrupted(self) -> bool:
         """Whether `interrupt` was called without a later `resume`."""
         return self._interrupted.is_set()
+
+
+LONGEST_STAND = 20.0
+"""Wall time after which a clock that stands goes on [s]: its process or the one that it waits for hangs."""
+
+PATIENCE = 10.0
+"""Factor of the wall-time limits of starting and answering processes on a virtual bench, whose host may be slow."""
+
+PROGRAMS = ("arm", "dose", "liquid")
+"""Programs that may make a promise: the arm's worker, the control loop of a dose, and the liquid that flows in it."""
+
+_NOW, _WRITTEN, _FIRST = 0, 1, 2
+
+
+class DeviceClock:
+    """The wall clock of real devices.
+
+    Attributes:
+        patience: factor of the wall-time limits of processes.
+    """
+
+    patience = 1.0
+
+    @property
+    def now(self) -> float:
+        """Time of the clock [s], increasing."""
+        return time.monotonic()
+
+    def promise(self, program: str, seconds: float) -> None:
+        """State that a program acts again before so much time has passed [s]; a shared clock waits for it then."""
+
+    def withdraw(self, program: str) -> None:
+        """End a program's promise."""
+
+
+class SharedClock(DeviceClock):
+    """The clock that the devices of a virtual bench share: numbers in a file that its processes map to memory.
+
+    Args:
+        path: of the file, which `create` has made.
+
+    Raises:
+        OSError: there is no such file.
+    """
+
+    patience = PATIENCE
+
+    def __init__(self, path: Path) -> None:
+        with path.open("r+b") as file:
+            self._numbers = memoryview(mmap.mmap(file.fileno(), 0)).cast("d")
+        self._latest = -math.inf
+        self._stands_since: float | None = None
+
+    @staticmethod
+    def create(path: Path) -> None:
+        """Make the file; the clock starts at the present time of the wall clock."""
+        numbers = [time.monotonic(), time.monotonic(), *[math.inf, 0.0] * len(PROGRAMS)]
+        path.write_bytes(array("d", numbers).tobytes())
+
+    @property
+    def now(self) -> float:
+        """See `DeviceClock.now`; as last written, and the wall time after a stand of `LONGEST_STAND`."""
+        standing = time.monotonic() - self._numbers[_WRITTEN] - LONGEST_STAND
+        self._latest = max(self._latest, self._numbers[_NOW] + max(standing, 0.0))
+        return self._latest
+
+    def promise(self, program: str, seconds: float) -> None:
+        """See `DeviceClock.promise`."""
+        place = _place(program)
+        self._numbers[place + 1] = float(os.getpid())
+        self._numbers[place] = self._numbers[_NOW] + seconds
+
+    def withdraw(self, program: str) -> None:
+        """See `DeviceClock.withdraw`."""
+        self._numbers[_place(program)] = math.inf
+
+    # ---- for the process that advances it
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass [s]; 0 while it waits."""
+        self._numbers[_NOW] += seconds
+        self._numbers[_WRITTEN] = time.monotonic()
+
+    @property
+    def allowed(self) -> float:
+        """Time until the first promise ends [s]. The clock waits there, but neither for a process that has ended nor
+        longer than `LONGEST_STAND` of wall time.
+        """
+        left = min(self._numbers[_place(program)] for program in PROGRAMS) - self._numbers[_NOW]
+        if left > 0.0:
+            self._stands_since = None
+            return left
+        self._stands_since = self._stands_since or time.monotonic()
+        hangs = time.monotonic() - self._stands_since > LONGEST_STAND
+        for program in PROGRAMS:
+            place = _place(program)
+            late = self._numbers[place] <= self._numbers[_NOW]
+            if late and (hangs or not _lives(int(self._numbers[place + 1]))):
+                self.withdraw(program)
+        return left
+
+
+def _place(program: str) -> int:
+    return _FIRST + 2 * PROGRAMS.index(program)
+
+
+def device_clock(path: str) -> DeviceClock:
+    """The clock of devices: the one of this file, or the wall clock without a file (on another machine, too)."""
+    with contextlib.suppress(OSError):
+        if path:
+            return SharedClock(Path(path))
+    return DeviceClock()
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

@@ -545,7 +545,7 @@ class CampaignFile(Settings):
     posteriors. A run's record has the resolved one."""
 
     on_unknown: Literal["ask", "repeat"] = "ask"
-    """Treatment on resume of a pour that had started and has no outcome; 'repeat' on a virtual bench only."""
+    """A pour that had started and has no outcome: 'ask' on resume; 'repeat' it, on a virtual bench only."""
 
     unattended: UnattendedSettings | None = None
     """Pours without a person, after one consent; needs a laboratory with places and a safeguard."""

@@ -26,9 +26,11 @@ from actors.interfaces import (
     InvalidActionError,
     Laboratory,
     LaboratoryError,
+    LinkLostError,
     NotPouredError,
     OperatorQuestion,
     ProgressCallback,
+    Restartable,
     SimulationError,
     SimulatorPool,
     UnknownPourError,
@@ -56,11 +58,14 @@ class RequestExecutorError(RunError):
 
     Attributes:
         problem: the cause, without the advice for a run that can be resumed.
+        nothing_poured: it is certain that a restarted virtual bench can make the pour.
+        unknown: a pour has begun, and has no outcome.
     """
 
-    def __init__(self, problem: str, way_on: str = "") -> None:
+    def __init__(self, problem: str, way_on: str = "", *, nothing_poured: bool = False, unknown: bool = False) -> None:
         super().__init__(problem + way_on)
         self.problem = problem
+        self.nothing_poured, self.unknown = nothing_poured, unknown
 
 
 class PourNotMadeError(RequestExecutorError):
@@ -250,7 +255,16 @@ class Deadlines:
 
 
 class RequestExecutor:
-    """Runs requests on a laboratory and converts errors of single requests into outcomes."""
+    """Runs requests on a laboratory and converts errors of single requests into outcomes.
+
+    Args:
+        laboratory: open.
+        scenes: of the plan, by name.
+        deadlines: of requests.
+        frame_rate: of recorded simulations [1/s].
+        ask_operator: answers questions of strategies.
+        repeats: a virtual bench repeats pours whose outcome is unknown.
+    """
 
     def __init__(
         self,
@@ -259,8 +273,11 @@ class RequestExecutor:
         deadlines: Deadlines,
         frame_rate: float,
         ask_operator: AskOperator | None = None,
+        *,
+        repeats: bool = False,
     ) -> None:
         self._laboratory, self._ask_operator = laboratory, ask_operator
+        self._repeats = repeats
         self._scenes = scenes
         self.deadlines = deadlines
         self._frame_rate = frame_rate
@@ -363,10 +380,11 @@ class RequestExecutor:
             except NotPouredError as error:
                 withdrawn(str(error))
                 _raise_if_cancelled()
-                raise PourNotMadeError(str(error), "; see to it, then resume the run") from error
+                lost = isinstance(error, LinkLostError)
+                raise PourNotMadeError(str(error), "; see to it, then resume the run", nothing_poured=lost) from error
             except UnknownPourError as error:
                 _raise_if_cancelled()
-                raise PourUnknownError(str(error), "; resuming asks for its outcome") from error
+                raise PourUnknownError(str(error), "; resuming asks for its outcome", unknown=True) from error
             except BenchLostError as error:
                 # No outcome: the operator must inspect the bench, and there is nothing left to pour with.
                 _raise_if_cancelled()
@@ -383,6 +401,20 @@ class RequestExecutor:
                     "; see to the bench. Resuming asks for its outcome",
                 ) from None
         return Poured(measurement)
+
+    async def restart(self, error: RequestExecutorError) -> bool:
+        """Restart a virtual bench, if a pour can be made again after this error.
+
+        Returns:
+            Whether it can: nothing was poured, or the plan repeats pours whose outcome is unknown.
+        """
+        laboratory = self._laboratory
+        repeatable = error.nothing_poured or (error.unknown and self._repeats)
+        if not repeatable or self.bench.mode != "virtual" or not isinstance(laboratory, Restartable):
+            return False
+        async with self._real:
+            await laboratory.restart_bench()
+        return True
 
     async def ask(self, request: Ask) -> Outcome:
         """Ask the operator at the bench, or for proposals the program or person who started the run.

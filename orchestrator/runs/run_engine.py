@@ -173,7 +173,14 @@ class _RunEngine:
             if isinstance(laboratory, Telling):
                 laboratory.listen(self._on_notice)
             self._check_bench(laboratory, histories)
-            executor = RequestExecutor(laboratory, self._scenes, self._deadlines, FRAME_RATE, self._ask_operator)
+            executor = RequestExecutor(
+                laboratory,
+                self._scenes,
+                self._deadlines,
+                FRAME_RATE,
+                self._ask_operator,
+                repeats=self._plan.on_unknown == "repeat",
+            )
             executor.speculation.changed = lambda running, waiting: self._journal.append(
                 SpeculationProgressed(running=running, waiting=waiting)
             )

@@ -39,7 +39,7 @@ from orchestrator.records.events import (
 )
 from orchestrator.records.journal import Journal
 from orchestrator.records.journal_file import JournalError
-from orchestrator.runs.request_executor import RequestExecutor
+from orchestrator.runs.request_executor import RequestExecutor, RequestExecutorError
 from orchestrator.runs.resume import StageHistory, replay, weighed_by_hand
 from sim_engine.outcome import RecordedFrames
 
@@ -93,6 +93,9 @@ def next_to_tell(pending_requests: Sequence[PendingRequest]) -> PendingRequest |
     first = min(pending_requests, key=lambda f: (_DELIVERY_ORDER[type(f.request)], f.id), default=None)
     return first if first is not None and first.outcome is not None else None
 
+
+REPEATS = 3
+"""Largest number of times for which a virtual bench is restarted for one pour."""
 
 _REPORT_INTERVAL = 0.3
 """Minimum time between two progress events of a strategy, unless the event is urgent [s]."""
@@ -234,7 +237,7 @@ class StageScheduler:
 
     async def _perform(self, pending: PendingRequest) -> None:
         """Execute one request and write its outcome to the journal."""
-        begin, frames, request = time.monotonic(), None, pending.request
+        begin, frames, request, attempt = time.monotonic(), None, pending.request, pending.attempt
 
         def started() -> None:
             nonlocal begin
@@ -258,8 +261,21 @@ class StageScheduler:
                     self._journal.append(PourWithdrawn(stage=self._stage, id=pending.id, reason=reason))
                     pending.started = False
 
-                self._journal.check_space_for_pour()
-                outcome = await self._executor.pour(request, started=started, withdrawn=withdrawn, progress=progress)
+                while True:
+                    self._journal.check_space_for_pour()
+                    try:
+                        outcome = await self._executor.pour(
+                            request, started=started, withdrawn=withdrawn, progress=progress
+                        )
+                        break
+                    except RequestExecutorError as error:
+                        if pending.attempt - attempt >= REPEATS or not await self._executor.restart(error):
+                            raise
+                        text = (
+                            f"{error.problem}. The virtual bench was restarted, and pour {request.number} is repeated"
+                        )
+                        self._journal.log("note", text, stage=self._stage, kept=True)
+                        pending.attempt += 1
             case Suggest():
 
                 def retrying(text: str) -> None:

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from actors.arm.arm_interface import FULL_SPEED
-from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
-from actors.arm.ur.primary_interface import Primary, PrimaryError
+from actors.arm.ur.dashboard import REPLY_TIMEOUT, Dashboard, DashboardError, stop_program
+from actors.arm.ur.primary_interface import STATE_TIMEOUT, Primary, PrimaryError
 from actors.arm.ur.rtde_client import AT_REST, RtdeClient
 from actors.arm.ur.worker_messages import (
     DONE,
@@ -39,6 +39,7 @@ from actors.arm.ur.worker_messages import (
     why_not_ready,
 )
 from actors.arm_geometry import JOINT_NAMES
+from actors.runtime.bench_clock import DeviceClock
 
 AT_START = 0.01
 """Largest distance of the joints from a path's first point [rad]; the program first removes it slowly."""
@@ -66,6 +67,9 @@ BEAT_INTERVAL, TELL_INTERVAL, LOOK_INTERVAL = 0.02, 0.05, 0.002
 FORCE_INTERVAL = 0.1
 """Time between two recorded forces [s of the path]."""
 
+LATEST = 0.1
+"""Time from one new package to the next one [s of the clock], for which the clock of a virtual bench waits."""
+
 OWNER_SILENCE = 3.0
 """Time without a sign of life after which the driver counts as dead [s of the clock]."""
 
@@ -78,7 +82,7 @@ class MotionMonitor:
         address: of the controller, for its other ports.
         motion: the motion.
         tell: called about twenty times a second with the progress.
-        owner_seen: time of the driver's last sign of life [s of `time.monotonic`].
+        owner_seen: time of the driver's last sign of life [s of the client's clock].
     """
 
     def __init__(
@@ -90,10 +94,12 @@ class MotionMonitor:
         owner_seen: Callable[[], float],
     ) -> None:
         self._client, self._address, self._motion = client, address, motion
+        self._time = client.clock
         self._report, self._owner_seen = tell, owner_seen
         self._ordered = threading.Event()
         self._samples: list[Sample] = []
         self._forces: list[ForceSample] = []
+        self._reading: DataPackage | None = None
         self._clock, self._slider = 0.0, 1.0
         self._delay = self._held = 0.0
         self._joints: tuple[float, ...] = motion.start
@@ -139,15 +145,16 @@ class MotionMonitor:
             )
         )
         self._refuse_if(_elsewhere(reading.joints, self._motion.start))
-        self._refuse_if(_not_remote(self._address))
+        self._refuse_if(_not_remote(self._address, self._time))
         self._joints = reading.joints
         try:
-            primary = Primary(self._address)
+            primary = Primary(self._address, STATE_TIMEOUT * self._time.patience)
         except PrimaryError as error:
             raise TroubleError("lost", str(error)) from None
         try:
             return self._through(primary)
         finally:
+            self._time.withdraw("arm")
             primary.close()
 
     @staticmethod
@@ -183,7 +190,7 @@ class MotionMonitor:
     def _until_ready(self, primary: Primary) -> str:
         """Wait for the program, and read back its settings. Returns why it must not continue, or ''."""
         motion, settings = self._motion, self._motion.settings
-        end = time.monotonic() + UPLOAD_TIME
+        end = self._time.now + UPLOAD_TIME
         while True:
             reading = self._look()
             if self._ordered.is_set():
@@ -194,14 +201,14 @@ class MotionMonitor:
                 payload_is_set = _near(payload, (settings.payload, *settings.centre), SAME_PAYLOAD)
                 if tool_is_set and payload_is_set:
                     return _elsewhere(reading.joints, motion.start) or (_slowed(reading) if motion.pours else "")
-                if time.monotonic() > end - 0.5 * UPLOAD_TIME:
+                if self._time.now > end - 0.5 * UPLOAD_TIME:
                     return (
                         f"tool and payload were set to {_show((*settings.tool, settings.payload, *settings.centre))}; "
                         f"the controller has {_show((*reading.tool, *payload))}"
                     )
             if self._is_stopped(reading):
                 return "the robot is not ready any more"
-            if primary.broken or time.monotonic() > end:
+            if primary.broken or self._time.now > end:
                 return "the program did not start on the controller"
             time.sleep(LOOK_INTERVAL)
 
@@ -222,7 +229,7 @@ class MotionMonitor:
             if reading.status_bits & FREEDRIVE:
                 return self._broken_off("safety", "the freedrive button was pressed")
             if reading.status == DONE and reading.number == motion.number:
-                arrived = arrived or time.monotonic()
+                arrived = arrived or self._time.now
                 if reading.runtime == STOPPED_PROGRAM and reading.stands:
                     if _near(reading.joints, motion.end, AT_END):
                         self._standing = time.monotonic()
@@ -232,7 +239,7 @@ class MotionMonitor:
                     return self._outcome(
                         "program ended", f"the path was run through, but {_elsewhere(reading.joints, motion.end)}"
                     )
-                if time.monotonic() - arrived > STANDING_TIME:
+                if self._time.now - arrived > STANDING_TIME:
                     return self._broken_off("program ended", "the arm does not come to rest at the path's end")
             elif reading.runtime != PLAYING and reading.time > self._began:
                 return self._stopped_by_program(primary)
@@ -240,7 +247,7 @@ class MotionMonitor:
                 return self._broken_off("program ended", _held(reading))
             if reading.time - self._began > motion.duration + self._delay + OVERTIME + STANDING_TIME:
                 return self._broken_off("program ended", "the motion takes far longer than planned")
-            if time.monotonic() - self._owner_seen() > OWNER_SILENCE and not motion.tilts:
+            if self._time.now - self._owner_seen() > OWNER_SILENCE * self._time.patience and not motion.tilts:
                 self.order_stop()
             time.sleep(LOOK_INTERVAL)
 
@@ -278,16 +285,16 @@ class MotionMonitor:
     def _broken_off(self, kind: str, text: str) -> MotionOutcome:
         """End the program in any state, and wait until the arm stands still."""
         self._client.order_stop(self._motion.number)
-        end = time.monotonic() + STANDING_TIME
+        end = self._time.now + STANDING_TIME
         requested = False
-        while time.monotonic() < end:
+        while self._time.now < end:
             reading = self._look()
             if reading.stands and reading.runtime == STOPPED_PROGRAM:
                 self._standing = self._standing or time.monotonic()
                 return self._outcome(kind, text)
             if reading.stands:
                 self._standing = self._standing or time.monotonic()
-            if not requested and (kind != "operator" or time.monotonic() > end - 0.6 * STANDING_TIME):
+            if not requested and (kind != "operator" or self._time.now > end - 0.6 * STANDING_TIME):
                 requested = True
                 self._end_program()
             time.sleep(LOOK_INTERVAL)
@@ -296,7 +303,7 @@ class MotionMonitor:
     def _end_program(self) -> None:
         self._client.order_stop(self._motion.number)
         with contextlib.suppress(DashboardError):
-            stop_program(self._address, 0.5)
+            stop_program(self._address, 0.5 * self._time.patience)
 
     def _outcome(self, kind: str, text: str) -> MotionOutcome:
         return MotionOutcome(
@@ -317,6 +324,9 @@ class MotionMonitor:
     def _look(self) -> DataPackage:
         self._write_heartbeat()
         reading = self._client.look(1.0 if self._went else AT_REST)
+        if reading is not self._reading:
+            self._reading = reading
+            self._time.promise("arm", LATEST)
         self._joints = reading.joints
         if self._went:
             self._slider = min(self._slider, reading.speed)
@@ -385,9 +395,9 @@ def _speed(reading: DataPackage) -> str:
     )
 
 
-def _not_remote(address: str) -> str:
+def _not_remote(address: str, clock: DeviceClock) -> str:
     try:
-        with Dashboard(address) as dashboard:
+        with Dashboard(address, REPLY_TIMEOUT * clock.patience) as dashboard:
             answer = dashboard.ask("is in remote control")
     except DashboardError as error:
         raise TroubleError("lost", str(error)) from None
@@ -418,7 +428,7 @@ def recover(client: RtdeClient, address: str, scale: float) -> str:
     Raises:
         TroubleError: names the manual action that is needed first.
     """
-    done = []
+    done, clock = [], client.clock
     try:
         mode = safety_mode(client.fresh().safety_mode)
         if mode.kind == "emergency stop":
@@ -427,7 +437,7 @@ def recover(client: RtdeClient, address: str, scale: float) -> str:
             raise TroubleError("refused", "the safeguard stop is still in force; leave the guarded area, then reset it")
         if mode.kind == "safety":
             raise TroubleError("refused", f"{mode.text} is in force: {mode.advice}")
-        with Dashboard(address) as dashboard:
+        with Dashboard(address, REPLY_TIMEOUT * clock.patience) as dashboard:
             # A paused program would resume, and the next uploaded program would be discarded.
             dashboard.demand("stop", "Stopped")
             dashboard.ask("close popup")
@@ -436,6 +446,7 @@ def recover(client: RtdeClient, address: str, scale: float) -> str:
                 _unlock(dashboard, scale)
                 done.append("protective stop unlocked")
                 _until(
+                    clock,
                     lambda: may_move(client.fresh().safety_mode, pours=False),
                     POWER_TIME / scale,
                     "the safety mode stays",
@@ -443,14 +454,22 @@ def recover(client: RtdeClient, address: str, scale: float) -> str:
             if client.fresh().robot_mode < _IDLE:
                 dashboard.demand("power on", "Powering on")
                 done.append("switched on")
-                _until(lambda: client.fresh().robot_mode >= _IDLE, POWER_TIME / scale, "the robot does not switch on")
+                _until(
+                    clock,
+                    lambda: client.fresh().robot_mode >= _IDLE,
+                    POWER_TIME / scale,
+                    "the robot does not switch on",
+                )
             if client.fresh().robot_mode != RUNNING_MODE:
                 dashboard.demand("brake release", "Brake releasing")
                 done.append("brakes released")
                 _until(
-                    lambda: client.fresh().robot_mode == RUNNING_MODE, POWER_TIME / scale, "the brakes are not released"
+                    clock,
+                    lambda: client.fresh().robot_mode == RUNNING_MODE,
+                    POWER_TIME / scale,
+                    "the brakes are not released",
                 )
-        _until(lambda: client.fresh().runtime == STOPPED_PROGRAM, 3.0, "a program still runs on the controller")
+        _until(clock, lambda: client.fresh().runtime == STOPPED_PROGRAM, 3.0, "a program still runs on the controller")
     except DashboardError as error:
         raise TroubleError("lost", str(error)) from None
     return ", ".join(done)
@@ -466,9 +485,9 @@ def _unlock(dashboard: Dashboard, scale: float) -> None:
         time.sleep(UNLOCK_DELAY / scale + 0.05)
 
 
-def _until(condition: Callable[[], bool], seconds: float, otherwise: str) -> None:
-    end = time.monotonic() + max(seconds, 3.0)
+def _until(clock: DeviceClock, condition: Callable[[], bool], seconds: float, otherwise: str) -> None:
+    end = clock.now + max(seconds, 3.0)
     while not condition():
-        if time.monotonic() > end:
+        if clock.now > end:
             raise TroubleError("refused", otherwise)
         time.sleep(0.02)

@@ -197,6 +197,7 @@ class Primary:
 
     Args:
         address: of the controller.
+        timeout: for its first state [s].
 
     Attributes:
         complaints: its latest messages about programs.
@@ -207,14 +208,14 @@ class Primary:
         PrimaryError: it cannot be reached, or sends no state.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, timeout: float = STATE_TIMEOUT) -> None:
         self.complaints: deque[str] = deque(maxlen=8)
         self.causes: deque[str] = deque(maxlen=4)
         self.broken = False
         self._rest = b""
         try:
-            self._socket = socket.create_connection((address, PORT), timeout=STATE_TIMEOUT)
-            end = time.monotonic() + STATE_TIMEOUT
+            self._socket = socket.create_connection((address, PORT), timeout=timeout)
+            end = time.monotonic() + timeout
             while not self._take(self._socket.recv(65536)):
                 if time.monotonic() > end:
                     raise PrimaryError("it sends no robot state")

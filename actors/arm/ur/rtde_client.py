@@ -34,6 +34,7 @@ from actors.arm.ur.worker_messages import (
     DataPackage,
     TroubleError,
 )
+from actors.runtime.bench_clock import DeviceClock
 
 PORTS = {rtde.PORT: "RTDE", 30001: "primary interface"}
 PROBE_TIME = 2.0
@@ -78,33 +79,37 @@ class RtdeClient:
         rate: of reading [Hz of the clock].
         silence: longest time without new data [s of the clock].
         registers: first of the three integer inputs that are written.
+        clock: of the controller.
 
     Raises:
         TroubleError: the controller cannot be reached, or another client writes these inputs.
     """
 
-    def __init__(self, address: str, rate: float, silence: float, registers: int) -> None:
+    def __init__(self, address: str, rate: float, silence: float, registers: int, clock: DeviceClock) -> None:
+        timeout = PROBE_TIME * clock.patience
         for port, name in PORTS.items():
-            _probe(address, port, name)
+            _probe(address, port, name, timeout)
         try:
-            with Dashboard(address, PROBE_TIME):
+            with Dashboard(address, timeout):
                 pass
         except DashboardError as error:
             raise TroubleError("lost", f"no robot at {address}: {error}. {_ENABLED}") from None
         for attempt in range(1, ATTEMPTS + 1):
             try:
-                self._outputs = (LibraryReader if has_library() else OutputReader)(address, rate)
-                self._inputs = InputWriter(address, registers)
+                self._outputs = (LibraryReader if has_library() else OutputReader)(address, rate, clock.patience)
+                self._inputs = InputWriter(address, registers, timeout=timeout)
                 self._tilt: InputWriter | None = None
                 break
             except TroubleError:
                 if attempt == ATTEMPTS:
                     raise
                 time.sleep(BETWEEN_ATTEMPTS)
-        self._address, self._registers = address, registers
+        self._address, self._registers, self._timeout = address, registers, timeout
+        self.clock = clock
         self._commands = int(time.monotonic() * 1e3) % 1_000_000  # not the number that an earlier client wrote last
         self._silence = silence
         self._last: DataPackage | None = None
+        self._changed = clock.now
         self._same_readings = 0
 
     # ---- reading
@@ -124,10 +129,10 @@ class RtdeClient:
         last = self._last
         if last is not None and values["timestamp"][0] == last.time:
             self._same_readings += 1
-            if self._same_readings >= _SAME_READINGS and time.monotonic() - last.seen > silences * self._silence:
+            if self._same_readings >= _SAME_READINGS and self.clock.now - self._changed > silences * self._silence:
                 raise TroubleError("lost", f"the controller has said nothing new for {silences * self._silence:g} s")
             return last
-        self._same_readings = 0
+        self._same_readings, self._changed = 0, self.clock.now
         self._last = DataPackage(
             time=values["timestamp"][0],
             seen=seen,
@@ -185,7 +190,7 @@ class RtdeClient:
             TroubleError: the controller does not answer, or another client writes one of them.
         """
         if self._tilt is None:
-            self._tilt = InputWriter(self._address, self._registers, TILT_INPUTS, "DOUBLE")
+            self._tilt = InputWriter(self._address, self._registers, TILT_INPUTS, "DOUBLE", self._timeout)
 
     def tilt(self, speed: float) -> None:
         """Write the wanted speed of the tilt [rad/s] with a new counter, in one package."""
@@ -205,20 +210,21 @@ class LibraryReader:
     Args:
         address: of the controller.
         rate: of packages [Hz].
+        patience: factor of the waits for its replies.
 
     Raises:
         TroubleError: the controller does not answer, or lacks a value.
     """
 
-    def __init__(self, address: str, rate: float) -> None:
+    def __init__(self, address: str, rate: float, patience: float = 1.0) -> None:
         from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
 
         try:
-            with socket.create_connection((address, rtde.PORT), timeout=PROBE_TIME) as connection:
+            with socket.create_connection((address, rtde.PORT), timeout=PROBE_TIME * patience) as connection:
                 known = rtde.Outputs(rtde.Requests(connection), (*_VARIABLES, _FORCE, _WRIST), rate).fields
             _require_variables(address, known)
             self._optional = [name for name in (_FORCE, _WRIST) if name in known]
-            with _bounded(CONSTRUCTION_TIME):
+            with _bounded(CONSTRUCTION_TIME * patience):
                 self._receive: Any = RTDEReceiveInterface(address, rate, [*_VARIABLES, *self._optional])
         except (OSError, RuntimeError, ValueError, rtde.PackageError) as error:
             raise TroubleError("lost", f"{address}: its RTDE does not answer as it should: {error}") from None
@@ -268,6 +274,7 @@ class OutputReader:
     Args:
         address: of the controller.
         rate: of packages [Hz].
+        patience: factor of the waits for its replies.
 
     Attributes:
         lost: why no more packages come; '' while they may.
@@ -276,10 +283,10 @@ class OutputReader:
         TroubleError: the controller does not answer, or lacks a value.
     """
 
-    def __init__(self, address: str, rate: float) -> None:
+    def __init__(self, address: str, rate: float, patience: float = 1.0) -> None:
         self.lost = ""
         try:
-            connection = socket.create_connection((address, rtde.PORT), timeout=PROBE_TIME)
+            connection = socket.create_connection((address, rtde.PORT), timeout=PROBE_TIME * patience)
             self._outputs = rtde.Outputs(rtde.Requests(connection), (*_VARIABLES, _FORCE, _WRIST), rate)
             self._latest = time.monotonic(), self._outputs.next()
             connection.settimeout(None)
@@ -310,6 +317,7 @@ class InputWriter:
         first: number of the first input.
         groups: inputs that are written together, counted from the first.
         kind: of the inputs, 'INT32' or 'DOUBLE'.
+        timeout: for each response [s].
 
     Raises:
         TroubleError: the controller does not answer, or another client writes one of the inputs.
@@ -321,13 +329,14 @@ class InputWriter:
         first: int,
         groups: Sequence[tuple[int, ...]] = ORDERS,
         kind: Literal["INT32", "DOUBLE"] = "INT32",
+        timeout: float = PROBE_TIME,
     ) -> None:
         self._writing = threading.Lock()
         self._recipes: dict[int, int] = {}
         self._code = "i" if kind == "INT32" else "d"
         word = "int" if kind == "INT32" else "double"
         try:
-            self._socket = socket.create_connection((address, rtde.PORT), timeout=PROBE_TIME)
+            self._socket = socket.create_connection((address, rtde.PORT), timeout=timeout)
             requests = rtde.Requests(self._socket)
             if requests.ask(rtde.REQUEST_PROTOCOL_VERSION, b"\0\2") != b"\1":
                 raise TroubleError("lost", f"{address}: its RTDE does not know protocol 2")
@@ -373,9 +382,9 @@ class InputWriter:
             self._writing.release()
 
 
-def _probe(address: str, port: int, name: str) -> None:
+def _probe(address: str, port: int, name: str, timeout: float) -> None:
     try:
-        with socket.create_connection((address, port), timeout=PROBE_TIME):
+        with socket.create_connection((address, port), timeout=timeout):
             pass
     except OSError as error:
         raise TroubleError(

@@ -12,11 +12,10 @@ import os
 import queue
 import sys
 import threading
-import time
 from multiprocessing.connection import Connection
 from typing import Any
 
-from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
+from actors.arm.ur.dashboard import REPLY_TIMEOUT, Dashboard, DashboardError, stop_program
 from actors.arm.ur.motion_execution import MotionMonitor, recover
 from actors.arm.ur.primary_interface import PrimaryError, read_state
 from actors.arm.ur.rtde_client import RtdeClient
@@ -29,8 +28,11 @@ from actors.arm.ur.worker_messages import (
     MotionProgress,
     TroubleError,
 )
+from actors.runtime.bench_clock import DeviceClock, device_clock
 
 HANDS_IN_TIME = 3.0
+READ_TIME = 3.0
+"""Longest wait for the robot's state [s]."""
 
 
 class Worker:
@@ -48,7 +50,8 @@ class Worker:
         self._address = ""
         self._monitor: MotionMonitor | None = None
         self._stops = 0
-        self._owner_seen = time.monotonic()
+        self._clock = DeviceClock()
+        self._owner_seen = self._clock.now
 
     # ---- lifetime
 
@@ -76,7 +79,7 @@ class Worker:
         with contextlib.suppress(EOFError, OSError):
             while True:
                 request = self._connection.recv()
-                self._owner_seen = time.monotonic()
+                self._owner_seen = self._clock.now
                 if request[0] == "stop":
                     self._stops = max(self._stops, request[1])
                     if (monitor := self._monitor) is not None:
@@ -100,10 +103,11 @@ class Worker:
 
     # ---- requests
 
-    def open(self, address: str, rate: float, silence: float, registers: int) -> DataPackage:
+    def open(self, address: str, rate: float, silence: float, registers: int, clock: str) -> DataPackage:
         """Connect; nothing moves."""
-        self._address = address
-        self._client = RtdeClient(address, rate, silence, registers)
+        self._address, self._clock = address, device_clock(clock)
+        self._owner_seen = self._clock.now
+        self._client = RtdeClient(address, rate, silence, registers, self._clock)
         return self._client.fresh()
 
     @property
@@ -117,13 +121,13 @@ class Worker:
         """Identity and state of the controller; nothing moves."""
         reading = self.client.fresh()
         try:
-            with Dashboard(self._address) as dashboard:
+            with Dashboard(self._address, REPLY_TIMEOUT * self._clock.patience) as dashboard:
                 version = _version(dashboard.ask("PolyscopeVersion"))
                 model = dashboard.ask("get robot model")
                 serial = dashboard.ask("get serial number")
                 program = dashboard.ask("programState")
                 remote = None if version[0] < 5 else dashboard.ask("is in remote control").lower() == "true"
-            state = read_state(self._address)
+            state = read_state(self._address, READ_TIME * self._clock.patience)
         except (DashboardError, PrimaryError) as error:
             raise TroubleError("lost", str(error)) from None
         return Facts(model, serial, version, remote, program, reading, state)
@@ -147,18 +151,18 @@ class Worker:
 
     def hands_in(self) -> None:
         """End any program, and check that none runs."""
-        end = time.monotonic() + HANDS_IN_TIME
+        end = self._clock.now + HANDS_IN_TIME
         refusal = ""
         if self.client.fresh().runtime != STOPPED_PROGRAM:
             try:
-                stop_program(self._address)
+                stop_program(self._address, REPLY_TIMEOUT * self._clock.patience)
             except DashboardError as error:
                 refusal = f" ({error})"
         while self.client.fresh().runtime != STOPPED_PROGRAM:
-            if time.monotonic() > end:
+            if self._clock.now > end:
                 raise TroubleError("refused", f"a program still runs on the controller{refusal}: keep hands out")
         try:
-            with Dashboard(self._address) as dashboard:
+            with Dashboard(self._address, REPLY_TIMEOUT * self._clock.patience) as dashboard:
                 answer = dashboard.ask("programState")
         except DashboardError as error:
             raise TroubleError("lost", str(error)) from None

@@ -33,6 +33,7 @@ from actors.arm.ur.worker_messages import (
 )
 from actors.arm.ur_settings import UrArmSettings
 from actors.arm_geometry import Joints, Pose, Vector
+from actors.runtime.bench_clock import DeviceClock, device_clock
 from actors.runtime.child_process import ConnectedProcess
 
 
@@ -107,12 +108,16 @@ SIGN_OF_LIFE = 0.1
 class WorkerProcess:
     """One worker, from its start to its end; never restarted.
 
+    Args:
+        clock: of the controller; its patience stretches deadlines.
+
     Attributes:
         progress: its latest progress report of a motion.
         pid: of the process.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, clock: DeviceClock) -> None:
+        self._clock = clock
         self._child = ConnectedProcess("actors.arm.ur.rtde_worker")
         self._connection = self._child.connection
         self.pid = self._child.pid
@@ -149,6 +154,7 @@ class WorkerProcess:
         if not self.alive:
             raise ArmLostError(self._obituary(method))
         self._send(("call", number, method, arguments))
+        deadline *= self._clock.patience
         end, reported = time.monotonic() + deadline, self.progress
         while time.monotonic() < end:
             try:
@@ -240,12 +246,12 @@ class Session:
         """
         self.discard()
         spec = self._spec
-        self._worker = WorkerProcess()
+        self._worker = WorkerProcess(device_clock(spec.clock))
         # Only a virtual controller has scaled time; the operating system may delay its process, unlike a real
         # controller.
         silence = SILENCE if spec.time_scale == 1.0 else 8.0 * SILENCE
         try:
-            self.ask("open", spec.address, spec.rate, silence, spec.registers, deadline=OPEN_TIME)
+            self.ask("open", spec.address, spec.rate, silence, spec.registers, spec.clock, deadline=OPEN_TIME)
             facts: Facts = self.ask("facts")
             self.facts = facts_of(facts)
             problems = robot_problems(spec, facts.model, facts.version, facts.state, rests=facts.reading.stands)

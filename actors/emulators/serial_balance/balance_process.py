@@ -21,7 +21,7 @@ from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import ChildProcess, python_module
 from actors.runtime.ray_cleanup import MARK
 
-REPLY_TIMEOUT = 40.0
+REPLY_TIMEOUT = 120.0
 """Longest wait for the process to start, or to reply [s]."""
 
 GRACE = 10.0
@@ -127,6 +127,7 @@ class VirtualSerialBalance(FarProcess):
         latency: float = 0.01,
         seed: tuple[int, ...] = (0,),
         tcp: bool = False,
+        clock: str = "",
     ) -> VirtualSerialBalance:
         """Start an emulated balance without a load.
 
@@ -138,6 +139,7 @@ class VirtualSerialBalance(FarProcess):
             latency: time between query and reply [s of the clock].
             seed: of noise and of faults.
             tcp: behind a serial server: its `port` is then `127.0.0.1:…`.
+            clock: file of the bench's clock; '' for the wall clock.
 
         Raises:
             LaboratoryError: it did not start.
@@ -150,6 +152,7 @@ class VirtualSerialBalance(FarProcess):
             "time_scale": time_scale,
             "latency": latency,
             "seed": list(seed),
+            "clock": clock,
         }
         return cls(settings, baud, tcp)
 
@@ -203,7 +206,7 @@ class SerialBalanceEmulator:
         # In scaled time, the transmission of characters would limit the speed of the bench.
         baud = spec.candidates()[0].baud if spec.time_scale == 1.0 and spec.dialect != AUTO else 0
         self._balance = VirtualSerialBalance.start(
-            dialect, baud=baud, scale=scale, time_scale=spec.time_scale, latency=0.002
+            dialect, baud=baud, scale=scale, time_scale=spec.time_scale, latency=0.002, clock=spec.clock
         )
         self._spec = spec.with_values(port=self._balance.port, dialect=dialect)
 

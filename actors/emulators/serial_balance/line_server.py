@@ -17,7 +17,6 @@ import signal
 import socket
 import sys
 import termios
-import time
 import tty
 from abc import ABC, abstractmethod
 from collections import deque
@@ -27,6 +26,7 @@ from typing import Any
 
 from actors.balance.scale_model import ScaleSettings
 from actors.emulators.serial_balance.emulated_balance import EmulatedBalance, Emulation
+from actors.runtime.bench_clock import DeviceClock, device_clock
 
 
 class LineEnd(ABC):
@@ -227,6 +227,9 @@ class TcpEnd(LineEnd):
                 self._client.send(data)
 
 
+SHORTEST_WAIT = 0.001
+"""Shortest wait of the server [s]."""
+
 _PARENT_CHECK = 1.0
 """Interval of the check whether the parent is alive [s]."""
 
@@ -237,10 +240,11 @@ class Server:
     Args:
         line: the balance's end of the line.
         character: the emulated balance.
+        clock: of the balance and its line.
     """
 
-    def __init__(self, line: LineEnd, character: EmulatedBalance) -> None:
-        self._line, self._balance = line, character
+    def __init__(self, line: LineEnd, character: EmulatedBalance, clock: DeviceClock) -> None:
+        self._line, self._balance, self._clock = line, character, clock
         self._orders = bytearray()
         self._parent = os.getppid()
 
@@ -248,11 +252,12 @@ class Server:
         """Run until the parent ends or closes its end."""
         wake: float | None = None
         while os.getppid() == self._parent:
-            now = time.monotonic()
-            timeout = _PARENT_CHECK if wake is None else min(max(wake - now, 0.0), _PARENT_CHECK)
+            now = self._clock.now
+            # a shared clock advances in steps, or stands
+            timeout = _PARENT_CHECK if wake is None else min(max(wake - now, SHORTEST_WAIT), _PARENT_CHECK)
             watched = [0] if self._line.descriptor is None else [0, self._line.descriptor]
             ready, _, _ = select.select(watched, [], [], timeout)
-            now = time.monotonic()
+            now = self._clock.now
             if 0 in ready and not self._take_orders(now):
                 return
             if self._line.descriptor is not None and self._line.descriptor in ready:
@@ -305,7 +310,7 @@ def serve(settings: dict[str, Any], make: Callable[[], EmulatedBalance]) -> None
     try:
         balance = make()
         tell({"port": line.port})
-        Server(line, balance).run()
+        Server(line, balance, device_clock(settings.get("clock", ""))).run()
     finally:
         line.unplug()
         with contextlib.suppress(OSError):

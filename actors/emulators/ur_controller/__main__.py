@@ -8,12 +8,14 @@ import json
 import sys
 from dataclasses import replace
 from math import radians
+from pathlib import Path
 
 from actors.emulators.ur_controller.control_clock import Host, until_orphaned
 from actors.emulators.ur_controller.controller import Controller
 from actors.emulators.ur_controller.fault_injection import FaultServer
 from actors.emulators.ur_controller.robot import HOME, MODELS, X_SOFTWARE, RobotMode, calibrated
 from actors.emulators.ur_controller.safety_system import SafetyConfiguration
+from actors.runtime.bench_clock import SharedClock
 
 _STATES = {"running": RobotMode.RUNNING, "idle": RobotMode.IDLE, "off": RobotMode.POWER_OFF}
 
@@ -31,9 +33,7 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--joints", help="six joint positions to begin with [deg], separated by commas")
     parser.add_argument("--local", action="store_true", help="begin in local control: programs are ignored")
     parser.add_argument("--fault-port", type=int, default=0, help="port for faults; any free one by default")
-    parser.add_argument(
-        "--normal-priority", action="store_true", help="don't let the clock go before other work on the machine"
-    )
+    parser.add_argument("--clock", type=Path, help="file of the clock that the devices of a bench share")
     parser.add_argument("--parent", type=int, help="end when this process does, or when standard input ends")
     chosen = parser.parse_args(given)
     given_joints: str | None = chosen.joints
@@ -73,7 +73,8 @@ async def serve(chosen: argparse.Namespace) -> None:
         remote=not chosen.local,
         joints=chosen.joints,
     )
-    host = Host(controller, chosen.address, prioritised=not chosen.normal_priority)
+    clock = None if chosen.clock is None else SharedClock(chosen.clock)
+    host = Host(controller, chosen.address, clock)
     await host.open()
     faults = FaultServer(host)
     fault_port = await faults.open(chosen.fault_port)

@@ -5,9 +5,13 @@
 
 from __future__ import annotations
 
+import os
 import random
+import shutil
 import socket
+import tempfile
 import time
+from pathlib import Path
 from typing import Any
 
 from actors.arm.arm_settings import History
@@ -15,9 +19,15 @@ from actors.arm.ur_settings import UrArmSettings
 from actors.emulators.ur_controller.controller_process import VirtualController, VirtualControllerError
 from actors.emulators.ur_controller.robot import MODELS, calibrated
 from actors.interfaces import LaboratoryError
+from actors.runtime.bench_clock import PATIENCE, SharedClock
+from actors.runtime.ray_cleanup import MARK
+from actors.runtime.remote_object import DeviceLostError
 
 PORTS = (29999, 30001, 30002, 30003, 30004, 30011, 30012)
 """Ports of a controller: the same at every address."""
+
+REPLY_TIMEOUT = 5.0 * PATIENCE
+"""Longest wait for a reply of the controller's process [s]."""
 
 ATTEMPTS = 20
 
@@ -36,8 +46,15 @@ class UrEmulator:
     """
 
     def __init__(self, spec: UrArmSettings) -> None:
-        self._spec = spec
-        self._controller = _start_controller(spec)
+        self._folder = Path(tempfile.mkdtemp(prefix="decant-clock-", dir=os.environ.get(MARK)))
+        clock = self._folder / "clock"
+        SharedClock.create(clock)
+        self._spec = spec.with_values(clock=str(clock))
+        try:
+            self._controller = _start_controller(self._spec)
+        except BaseException:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise
 
     @property
     def arm(self) -> UrArmSettings:
@@ -57,32 +74,41 @@ class UrEmulator:
         up = ", ".join(f"{9.82 * value!r}" for value in arm.mount.up)
         lines = [f"set_gravity([{up}])", f"set_tcp(p[{tool}])", f"set_payload({arm.payload!r}, [{centre}])"]
         program = "\n  ".join(["def install():", *lines]) + "\nend\n"
-        with socket.create_connection((self._controller.address, SCRIPTS), timeout=5.0) as connection:
+        before = self._state()["messages"]
+        with socket.create_connection((self._controller.address, SCRIPTS), timeout=REPLY_TIMEOUT) as connection:
             connection.sendall(program.encode("ascii"))
-            time.sleep(0.3)
+            end = time.monotonic() + REPLY_TIMEOUT
+            while (state := self._state())["runtime_state"] != "STOPPED" or state["messages"] == before:
+                if time.monotonic() > end:
+                    raise LaboratoryError("the virtual arm does not take its settings over")
+                time.sleep(0.01)
+
+    def _state(self) -> dict[str, Any]:
+        return self._controller.fault("state", timeout=REPLY_TIMEOUT)
 
     def history(self, since: float) -> History:
         """See `ArmEmulator.history`; two minutes of it are kept.
 
         Raises:
-            LaboratoryError: the controller does not reply.
+            DeviceLostError: the controller does not reply.
         """
         try:
-            answer = self._controller.fault("history", since=since)
+            answer = self._controller.fault("history", since=since, timeout=REPLY_TIMEOUT)
         except VirtualControllerError as error:
-            raise LaboratoryError(f"what the virtual arm did is not known: {error}") from error
+            raise DeviceLostError(f"what the virtual arm did is not known: {error}") from error
         return History(tuple(answer["times"]), tuple(tuple(q) for q in answer["joints"]), float(answer["now"]))
 
     def fault(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """See `ArmEmulator.fault`, and docs/reference/virtual-devices.md."""
         try:
-            return self._controller.fault(name, **arguments)
+            return self._controller.fault(name, timeout=REPLY_TIMEOUT, **arguments)
         except VirtualControllerError as error:
             raise LaboratoryError(str(error)) from error
 
     def close(self) -> None:
         """End it. May be called again."""
         self._controller.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
 
 
 def _start_controller(arm: UrArmSettings) -> VirtualController:
@@ -95,7 +121,7 @@ def _start_controller(arm: UrArmSettings) -> VirtualController:
         try:
             frequency = FREQUENCY if arm.time_scale > 1.0 else None
             return VirtualController.start(
-                address, arm.model, arm.time_scale, frequency, calibrated=True, joints=arm.home.angles
+                address, arm.model, arm.time_scale, frequency, calibrated=True, joints=arm.home.angles, clock=arm.clock
             )
         except VirtualControllerError as error:
             reason = str(error)

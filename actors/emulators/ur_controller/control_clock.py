@@ -25,6 +25,7 @@ from actors.emulators.ur_controller.servers.dashboard_server import DashboardCon
 from actors.emulators.ur_controller.servers.primary_server import PrimaryConnection, PrimaryServer
 from actors.emulators.ur_controller.servers.robot_api_server import RobotApiConnection
 from actors.emulators.ur_controller.servers.rtde_server import RtdeConnection, RtdeServer
+from actors.runtime.bench_clock import SharedClock
 
 SLOWEST_WAKE = 0.002
 """Shortest wall time between two wake-ups of the clock [s]; in scaled time, each wake-up runs several ticks."""
@@ -32,44 +33,12 @@ SLOWEST_WAKE = 0.002
 MOST_BEHIND = 0.1
 """Longest lag of the clock in wall time [s]; more is dropped, because a controller never runs faster to catch up."""
 
-BUSY = 0.75
-"""Share of a second's processor time above which the clock gives its priority up."""
-
 LONGEST_WAKE = 0.05
 """Wall time after which a wake-up with more pending cycles serves the ports first [s]."""
 
-REAL_TIME = 1
-"""Real-time priority of the clock's thread: the lowest one, which is above all work that is not real-time."""
-
-NICENESS = -10
-"""Niceness of the clock's thread if real-time priority is not permitted."""
-
-
-def raise_priority() -> str:
-    """Raise the priority of the calling thread above other work on the machine, as far as the system permits.
-
-    The process's other threads and its children do not get the real-time priority.
-
-    Returns:
-        The granted priority: 'real-time', 'nice -10' or 'normal'.
-    """
-    with contextlib.suppress(OSError, AttributeError):  # macOS has no such call
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(REAL_TIME))
-        return "real-time"
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
-        return f"nice {NICENESS}"
-    return "normal"
-
-
-def lower_priority() -> str:
-    """Revert `raise_priority`. Returns 'normal'."""
-    with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    with contextlib.suppress(OSError):
-        if os.getpriority(os.PRIO_PROCESS, 0) < 0:
-            os.setpriority(os.PRIO_PROCESS, 0, 0)
-    return "normal"
+SILENCE = 0.2
+"""Wall time after which clients get a package although the clock stands [s]: they count a longer silence as a lost
+connection, the unmodified ur-rtde after 2.5 s."""
 
 
 @dataclass
@@ -83,7 +52,6 @@ class Timing:
         dropped: wall time that was dropped because the process was too far behind [s].
         started: start of the clock [s of `time.monotonic`].
         busy_at_start: processor time of this process at that moment [s].
-        priority: of the clock's thread; see `raise_priority`.
     """
 
     ticks: int = 0
@@ -92,9 +60,8 @@ class Timing:
     dropped: float = 0.0
     started: float = 0.0
     busy_at_start: float = 0.0
-    priority: str = "normal"
 
-    def report(self) -> dict[str, float | str]:
+    def report(self) -> dict[str, float]:
         """Return the statistics for logs and tests."""
         wall = max(time.monotonic() - self.started, 1e-9)
         return {
@@ -104,7 +71,6 @@ class Timing:
             "dropped": self.dropped,
             "wall": wall,
             "cpu": (time.process_time() - self.busy_at_start) / wall,
-            "priority": self.priority,
         }
 
 
@@ -114,11 +80,11 @@ class Host:
     Args:
         controller: the hosted controller.
         address: of all ports.
-        prioritised: run the clock with raised priority if the system permits it. Not in time that is scaled up: there
-            the clock takes much of a core.
+        clock: shared with the other devices of a bench; it is advanced with the control cycles, and they wait for the
+            promises of its programs. None for a controller on its own.
     """
 
-    def __init__(self, controller: Controller, address: str, *, prioritised: bool = False) -> None:
+    def __init__(self, controller: Controller, address: str, clock: SharedClock | None = None) -> None:
         self.controller = controller
         self.address = address
         self.timing = Timing()
@@ -133,8 +99,8 @@ class Host:
         self._opening: asyncio.Task[None] | None = None
         self._clock: asyncio.TimerHandle | None = None
         self._next = 0.0
-        self._worked = self._woke = self._wall = 0.0
-        self._prioritised = prioritised and controller.time_scale <= 1.0
+        self._published = self._published_wall = self._wall = 0.0
+        self._shared = clock
 
     # ---- ports
 
@@ -203,11 +169,8 @@ class Host:
 
     def start(self) -> None:
         """Start the clock."""
-        if self._prioritised:
-            self.timing.priority = raise_priority()
         self.timing.started, self.timing.busy_at_start = time.monotonic(), time.process_time()
-        self._next = self._woke = asyncio.get_running_loop().time()
-        self._worked = time.thread_time()
+        self._next = asyncio.get_running_loop().time()
         self._wake()
 
     def _wake(self) -> None:
@@ -221,28 +184,44 @@ class Host:
         if behind > MOST_BEHIND:
             self.timing.dropped += behind - MOST_BEHIND
             self._next = now - MOST_BEHIND
-        if self.timing.priority != "normal" and now > self._woke + 1.0:
-            worked = time.thread_time()
-            if worked - self._worked > BUSY * (now - self._woke):
-                # Its own work, for example a program's: other processes would get no processor time.
-                self.timing.priority = lower_priority()
-            self._worked, self._woke = worked, now
+        uploads = self.connections.uploads
         try:
-            while self._next <= now and loop.time() < now + LONGEST_WAKE:
+            while self._next <= now and loop.time() < now + LONGEST_WAKE and self._runs(period):
                 self._next += period
-                if not self.halted:
-                    self.timing.ticks += 1
-                    self._wall += controller.dt / max(1.0, controller.time_scale)
-                    controller.tick()
+                self._tick(period)
+            if not self._runs(period):  # no time passes, and none is caught up later
+                self._next = now + SLOWEST_WAKE
+                if now - self._published > SILENCE:
+                    self._wall += SILENCE
+                    if uploads.translating:  # so that packages have new times
+                        self._tick(period)
+            if self._shared is not None:
+                self._shared.advance(0.0)
             if not self.halted:
-                self.connections.uploads.work(0.5 * max(period, SLOWEST_WAKE))
-                self.rtde.publish(self._wall)
-                self.primary.publish(self._wall)
+                uploads.work(0.5 * max(period, SLOWEST_WAKE))
+                if self._wall != self._published_wall:
+                    self._published, self._published_wall = now, self._wall
+                    self.rtde.publish(self._wall)
+                    self.primary.publish(self._wall)
         except Exception:
             # A defect in this program: ending is better than a clock that silently stands still.
             traceback.print_exc()
             raise SystemExit(1) from None
         self._clock = loop.call_at(max(self._next, now + min(period, SLOWEST_WAKE)), self._wake)
+
+    def _runs(self, period: float) -> bool:
+        """Whether time passes: not while a program is loaded, or while the bench waits for a program that is late."""
+        return not self.connections.uploads.translating and (
+            self._shared is None or self.connections.silent or self._shared.allowed > period
+        )
+
+    def _tick(self, period: float) -> None:
+        if self._shared is not None:
+            self._shared.advance(period)
+        if not self.halted:
+            self.timing.ticks += 1
+            self._wall += self.controller.dt / max(1.0, self.controller.time_scale)
+            self.controller.tick()
 
 
 HUNG = 20.0

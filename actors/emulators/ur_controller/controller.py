@@ -19,7 +19,7 @@ from actors.emulators.ur_controller.safety_system import Safety, SafetyConfigura
 from actors.emulators.ur_controller.servers.primary_messages import ControllerMessage, Listener
 from actors.emulators.ur_controller.urscript.lexer import ScriptError
 from actors.emulators.ur_controller.urscript.program import Program, waiting
-from actors.emulators.ur_controller.urscript.translator import translate
+from actors.emulators.ur_controller.urscript.translator import Translated, translate
 
 
 class RuntimeState(IntEnum):
@@ -115,18 +115,26 @@ class Controller:
         """Whether a program runs."""
         return self.runtime is RuntimeState.PLAYING
 
-    def upload(self, text: str) -> None:
-        """Run a program and end the current one. A program that cannot be run is refused with a message, whatever the
-        error.
-        """
+    def translated(self, text: str) -> Translated | ScriptError:
+        """Translate a program for `start`, or return why it cannot be run; may be called in any thread."""
         try:
-            program = Program(translate(text, waiting(self._commands)), self._commands)
-        except Exception as error:
-            if not isinstance(error, ScriptError):  # a defect of the emulator
-                traceback.print_exception(error)
-                error = ScriptError(f"internal error of the controller: {error}")
-            self.tell("exception", f"compile error: {error.text}", error.line)
+            return translate(text, waiting(self._commands))
+        except ScriptError as error:
+            return error
+        except Exception as error:  # a defect of the emulator
+            traceback.print_exception(error)
+            return ScriptError(f"internal error of the controller: {error}")
+
+    def upload(self, text: str) -> None:
+        """Translate and start a program."""
+        self.start(self.translated(text))
+
+    def start(self, translated: Translated | ScriptError) -> None:
+        """Run a program and end the current one. A program that cannot be run is refused with a message."""
+        if isinstance(translated, ScriptError):
+            self.tell("exception", f"compile error: {translated.text}", translated.line)
             return
+        program = Program(translated, self._commands)
         if program.secondary:
             if len(self.secondary) >= MOST_SECONDARY:
                 self.tell("key", f"program {program.name} not started: {MOST_SECONDARY} secondary programs run already")

@@ -15,7 +15,7 @@ from typing import Any
 
 from actors.runtime.child_process import ChildProcess, python_module
 
-START_TIME = 40.0
+START_TIME = 120.0
 """Longest wait until the process is ready [s]."""
 
 
@@ -51,7 +51,7 @@ class VirtualController:
         calibrated: bool = False,
         polyscope_x: bool = False,
         joints: Sequence[float] | None = None,
-        prioritised: bool = True,
+        clock: str = "",
         timeout: float = START_TIME,
     ) -> VirtualController:
         """Start the process and wait until all its ports are open.
@@ -66,7 +66,8 @@ class VirtualController:
             calibrated: the robot differs from nominal lengths, as a real one does.
             polyscope_x: software 10.14, with a Robot API instead of the dashboard.
             joints: six initial positions [rad]; a pose in the middle of its workspace by default.
-            prioritised: raise the priority of its clock; see docs/reference/virtual-devices.md, "Control period".
+            clock: file of the clock that the devices of a bench share (`actors.runtime.bench_clock.SharedClock`); ''
+                for none.
             timeout: longest wait [s].
 
         Raises:
@@ -78,7 +79,7 @@ class VirtualController:
         command += ["--local"] if local else []
         command += ["--calibrated"] if calibrated else []
         command += ["--polyscope-x"] if polyscope_x else []
-        command += [] if prioritised else ["--normal-priority"]
+        command += ["--clock", clock] if clock else []
         command += [] if joints is None else ["--joints=" + ",".join(repr(degrees(q)) for q in joints)]
         process = ChildProcess(command)
         try:

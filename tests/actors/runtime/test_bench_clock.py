@@ -1,0 +1,70 @@
+"""The clock that the devices of a virtual bench share."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from actors.runtime import bench_clock
+from actors.runtime.bench_clock import DeviceClock, SharedClock, device_clock
+from actors.runtime.child_process import child_environment
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    SharedClock.create(tmp_path / "clock")
+    return tmp_path / "clock"
+
+
+def test_all_that_share_it_read_the_time_that_its_controller_has_written(file: Path) -> None:
+    controller, balance = SharedClock(file), device_clock(str(file))
+    before = balance.now
+    assert balance.now == before, "it stands"
+    controller.advance(0.25)
+    assert balance.now == pytest.approx(before + 0.25)
+
+
+def test_it_does_not_pass_what_a_program_has_promised_until_the_program_acts_again(file: Path) -> None:
+    controller, worker = SharedClock(file), SharedClock(file)
+    worker.promise("arm", 0.1)
+    controller.advance(0.1)
+    assert controller.allowed <= 0.0
+    worker.promise("arm", 0.1)
+    assert controller.allowed == pytest.approx(0.1)
+    worker.withdraw("arm")
+    assert controller.allowed == float("inf")
+
+
+def test_it_waits_for_no_program_that_has_ended(file: Path) -> None:
+    text = "import sys; from pathlib import Path; from actors.runtime.bench_clock import SharedClock; "
+    text += "SharedClock(Path(sys.argv[1])).promise('dose', 0.0)"
+    subprocess.run([sys.executable, "-c", text, str(file)], check=True, env=child_environment())
+    controller = SharedClock(file)
+    assert controller.allowed <= 0.0
+    assert controller.allowed == float("inf")
+
+
+def test_it_goes_on_without_its_controller_and_without_a_program_that_hangs(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What hangs is not late: then devices have to fail as real ones do."""
+    controller, driver = SharedClock(file), SharedClock(file)
+    driver.promise("arm", 0.0)
+    begin, real = driver.now, time.monotonic()
+    assert controller.allowed <= 0.0
+    monkeypatch.setattr(bench_clock.time, "monotonic", lambda: real + bench_clock.LONGEST_STAND + 3.0)
+    assert driver.now > begin + 2.0
+    assert controller.allowed <= 0.0
+    assert controller.allowed == float("inf")
+
+
+def test_hardware_and_other_machines_have_the_wall_clock(tmp_path: Path) -> None:
+    for path in ("", str(tmp_path / "not here")):
+        clock = device_clock(path)
+        assert type(clock) is DeviceClock
+        assert clock.patience == 1.0
+        assert abs(clock.now - time.monotonic()) < 60.0
