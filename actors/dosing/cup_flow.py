@@ -186,6 +186,13 @@ def median(values: Floats) -> float:
     return 0.5 * float(ordered[half] + ordered[-1 - half])
 
 
+def quantile(values: Floats, share: float) -> float:
+    """numpy's default quantile of a few hundred values, which takes ten times as long there."""
+    ordered, place = np.sort(values), share * (len(values) - 1)
+    first = min(int(place), len(values) - 2)
+    return float(ordered[first] + (place - first) * (ordered[first + 1] - ordered[first]))
+
+
 def _bilinear(table: Floats, row: Floats, column: Floats) -> Floats:
     """Values of a table at fractional places, clamped to it, elementwise."""
     # (1 − u) ((1 − v) t_ij + v t_i,j+1) + u (…)_i+1, in place where it can be: this is half of a simulated dose
@@ -196,7 +203,8 @@ def _bilinear(table: Floats, row: Floats, column: Floats) -> Floats:
     place *= columns
     place += j
     flat = table.ravel()
-    low, high = flat.take(place), flat.take(place + columns)
+    low: Floats = flat.take(place)
+    high: Floats = flat.take(place + columns)
     low += v * (flat.take(place + 1) - low)
     high += v * (flat.take(place + (columns + 1)) - high)
     high -= low

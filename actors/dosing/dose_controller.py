@@ -28,7 +28,7 @@ from enum import StrEnum
 import numpy as np
 
 from actors.balance.display_quality import FLOW_ERROR, dose_tolerance
-from actors.dosing.cup_flow import LARGEST_TILT, CupFlow, Floats, median
+from actors.dosing.cup_flow import LARGEST_TILT, CupFlow, Floats, median, quantile
 from actors.dosing.display_belief import REPEATS, DisplayBelief
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading
 from actors.dosing_settings import DosingSettings
@@ -394,7 +394,7 @@ class DoseController:
 
     def _approach(self) -> float:
         e = self._estimator
-        early = float(np.quantile(self._cup.tilt_for(e.volume, np.zeros_like(e.volume)) + e.onset_bias, 0.03))
+        early = quantile(self._cup.tilt_for(e.volume, np.zeros_like(e.volume)) + e.onset_bias, 0.03)
         ahead = self._tilt + self._speed * self._settings.latency
         if self._rising >= 2:
             self._enter(DosePhase.POUR)
@@ -405,7 +405,7 @@ class DoseController:
         if ahead < early:
             return self._towards(early + 0.01, self._settings.approach_speed, ahead)
         # Growth dm/dθ = ρ (−dV/dθ) [kg/rad] of the flow's rate with the speed of the tilt
-        aim = float(np.quantile(self._tilts_for(self.fine_flow), 0.35))
+        aim = quantile(self._tilts_for(self.fine_flow), 0.35)
         growth = self._cup.volume_per_tilt(median(e.volume), 2e-3) * self._cup.density
         # the flow at the moment when the stream is seen is about growth × speed × delay / lag of the cup
         calm = 2.0 * self.fine_flow / growth * SEEN_AFTER / (SEEN_AFTER + self._blind())
@@ -734,7 +734,7 @@ class DoseController:
         rare = e.repeats.run < IMPROBABLE_HOLD or self._now - self._unchanged_since > self._patience(LONGEST_HOLD)
         if e.repeats.run == 0.0 or not rare:
             return False
-        surely = float(np.quantile(e.reading, 0.1)) - 0.5 * self._step_size
+        surely = quantile(e.reading, 0.1) - 0.5 * self._step_size
         return surely - shown > max(4.0 * SEEN, self._step_size)
 
     def _pause(self, suspected: DoseEnd | None = None) -> None:

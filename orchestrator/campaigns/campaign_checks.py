@@ -531,9 +531,8 @@ class _Checker:
 
         assert plan.dispense is not None
         assert plan.dispense.mixtures is not None
-        self.doing("predicting the doses of the mixtures")
         try:
-            forecast = MixtureForecast(plan)
+            forecast = MixtureForecast(plan, self.doing)
         except InvalidActionError as error:
             self.add((("mixtures",),), str(error))
             return

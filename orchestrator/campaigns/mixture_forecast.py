@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -38,6 +38,7 @@ class MixtureForecast:
 
     Args:
         plan: of a campaign with mixtures.
+        doing: called with a description of each prediction before it begins; a prediction takes seconds.
 
     Attributes:
         fills: how often each source is filled, if every dose is as wanted and all are filled at the beginning.
@@ -47,20 +48,22 @@ class MixtureForecast:
         InvalidActionError: a dose is impossible.
     """
 
-    def __init__(self, plan: CampaignPlan) -> None:
+    def __init__(self, plan: CampaignPlan, doing: Callable[[str], None] = lambda text: None) -> None:
         series = plan.dispense
         assert series is not None
         assert series.mixtures is not None
         self._series, self._cups, self._laboratory = series, series.mixtures.cups, plan.laboratory
         self._predicted: dict[str, list[tuple[float, DoseForecast]]] = {}
-        for liquid in dict.fromkeys(dose.liquid or "" for dose in series.doses):
-            # neither the campaign's seed nor other liquids decide what is supported
-            seeds = SeedStream(0, "predict mixtures")
-            planned = {dose.amount: dose for dose in series.doses if dose.liquid == liquid}
-            self._predicted[liquid] = [
-                (amount, self._prediction(planned[amount], seeds.next() % 2**32))
-                for amount in sorted({min(planned), max(planned)})
-            ]
+        planned: dict[str, dict[float, PlannedDose]] = {}
+        for dose in series.doses:
+            planned.setdefault(dose.liquid or "", {})[dose.amount] = dose
+        chosen = [(liquid, amount) for liquid, doses in planned.items() for amount in sorted({min(doses), max(doses)})]
+        # neither the campaign's seed nor other liquids decide what is supported
+        seeds = {liquid: SeedStream(0, "predict mixtures") for liquid in planned}
+        for number, (liquid, amount) in enumerate(chosen, 1):
+            doing(f"predicting the doses of the mixtures, {number} of {len(chosen)}: {1e3 * amount:.3g} g of {liquid}")
+            predicted = self._prediction(planned[liquid][amount], seeds[liquid].next() % 2**32)
+            self._predicted.setdefault(liquid, []).append((amount, predicted))
         self.fills = self._fillings(plan.seed)
         bench, arm = plan.laboratory.bench, plan.laboratory.arm
         attended = plan.laboratory.operator.time + arm.warning_time if arm is not None else None

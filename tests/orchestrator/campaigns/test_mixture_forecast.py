@@ -83,7 +83,10 @@ def test_later_doses_cost_no_further_predictions(tmp_path: Path, monkeypatch: py
     calls = []
     original = mixture_forecast.predicted_dose
     monkeypatch.setattr(mixture_forecast, "predicted_dose", lambda *a: calls.append(a) or original(*a))
-    MixtureForecast(load_campaign(path))
+    said: list[str] = []
+    MixtureForecast(load_campaign(path), said.append)
+    assert said[0] == "predicting the doses of the mixtures, 1 of 4: 20 g of ethanol"
+    assert len(said) == len(set(said)) == 4
     assert len(calls) == 4
 
 
