@@ -42,7 +42,7 @@ def load_campaign(
 
     Args:
         path: the file.
-        laboratory: a laboratory's file that replaces the campaign's laboratory.
+        laboratory: a laboratory's file that replaces the campaign's laboratory, which may then be missing.
         seed: replaces the campaign's seed.
         memory: of the run that is resumed; it replaces the campaign's `prior`, which could find other runs by now.
         posteriors: opens those of this machine, for a campaign with a `prior`.
@@ -72,6 +72,8 @@ def campaign_from(
     place = Place(document)
     if (other := wrong_kind(place.document, "campaign")) is not None:
         raise ConfigError([other])
+    if laboratory is not None and isinstance(document.data, dict):
+        document.data.setdefault("laboratory", str(resolved(laboratory)))
     section = validate(CampaignFile, place, report)
     if section is not None and laboratory is not None:
         section = section.model_copy(update={"laboratory": str(resolved(laboratory))})

@@ -30,6 +30,7 @@ from orchestrator.cli import (
     run_commands,
     simulate_command,
     station_commands,
+    token_commands,
     view_command,
 )
 from orchestrator.cli.command_options import add_command, add_group
@@ -203,6 +204,17 @@ _server(
 _server(queue_commands.shutdown, "decant server stop   # finishes and weighs a pour that has begun", name="stop")
 _server(station_commands.backup, "decant server backup decant-2030-03-01.zip")
 _server(station_commands.restore, "decant server restore decant-2030-03-01.zip --state ./restored")
+
+_token = add_group(
+    _server.args[0],
+    "token",
+    "Access tokens of the server's users; a running server reads them again at once.",
+    "decant server token add operator anna --days 365   # prints the token once",
+    "decant server token revoke anna",
+)
+_token(token_commands.add, "decant server token add operator anna", "decant server token add viewer screen --days 90")
+_token(token_commands.revoke, "decant server token revoke anna")
+_token(token_commands.list_all, "decant server token list", name="list")
 
 _queue = _group(
     "queue",

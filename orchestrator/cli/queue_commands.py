@@ -6,6 +6,8 @@ The HTTP client is in `orchestrator.daemon.api.daemon_client`.
 from __future__ import annotations
 
 import json
+import re
+import secrets
 import sys
 import time
 from collections.abc import Iterator
@@ -106,7 +108,10 @@ def submit(
     rig: Annotated[str, typer.Option(help="Rig to run on, if several match.")] = "",
     priority: Annotated[int, typer.Option(help="Higher priorities run first.")] = 0,
     caller_id: Annotated[
-        str, typer.Option("--id", help="Id of your own: the same campaign with the same id is queued once.")
+        str,
+        typer.Option(
+            "--id", help="Id of your own: the same campaign with the same id is queued once. Default: a new one."
+        ),
     ] = "",
     not_before: Annotated[
         str | None, typer.Option(metavar="TIME", help="Earliest start with its zone: 2026-11-27T08:00:00+01:00.")
@@ -122,31 +127,65 @@ def submit(
     state: State = None,
     as_json: Json = False,
 ) -> None:
-    """Add a campaign to the daemon's queue, with copies of all files that it refers to."""
+    """Add a campaign to the daemon's queue, with copies of all files that it refers to.
+
+    The daemon checks it first, as `decant run` does, which takes minutes for a rack of cups; the command waits for the
+    result. Ctrl-C ends the waiting only. A campaign without `laboratory` runs on the daemon's rig.
+    """
     from orchestrator.cli.foreground_run import read_campaign
-    from orchestrator.daemon.rigs.submissions import pack
+    from orchestrator.daemon.rigs.submissions import names_laboratory, pack, pack_unresolved
 
-    plan = read_campaign(campaign, laboratory, seed)
-    if (parameters, receiver, iterations) != (None, None, None):
-        from orchestrator.cli.campaign_commands import planning_request
-
-        if task != "plan":
-            raise RefusalError("--parameters, --receiver and --iterations go with --task plan")
-        plan = planning_request(plan, parameters, receiver, iterations).campaign
+    changes = (laboratory, seed, parameters, receiver, iterations)
     try:
-        packed, files = pack(plan, parameters)
+        if changes == (None,) * 5 and not names_laboratory(campaign):
+            packed, files = pack_unresolved(campaign)
+        else:
+            plan = read_campaign(campaign, laboratory, seed)
+            if (parameters, receiver, iterations) != (None, None, None):
+                from orchestrator.cli.campaign_commands import planning_request
+
+                if task != "plan":
+                    raise RefusalError("--parameters, --receiver and --iterations go with --task plan")
+                plan = planning_request(plan, parameters, receiver, iterations).campaign
+            packed, files = pack(plan, parameters)
     except OSError as error:
         raise RefusalError(f"{error.filename}: {error.strerror}") from None
+    caller_id = caller_id or f"{campaign.stem[:40]}-{secrets.token_hex(6)}"
+    if not re.match("[A-Za-z0-9]", caller_id):
+        caller_id = f"id-{caller_id}"
     with connected_client(url, state) as client:
         body = {"text": packed, "files": files, "task": task, "rig": rig, "priority": priority, "id": caller_id}
-        queued = client.post("/campaigns", {**body, "not_before": not_before})
+        queued = client.submit({**body, "not_before": not_before})
+        if queued["state"] == "checking":
+            queued = _checked(client, queued)
+    if queued["state"] == "refused":
+        raise RefusalError(queued["reason"])
     if as_json:
         print_json(queued)
         return
     print(queued["id"])
-    print_note(f"queued for {queued['rig']}; follow it with: decant queue logs -f {queued['id']}")
+    print_note(f"{queued['state']} for {queued['rig']}; follow it with: decant queue logs -f {queued['id']}")
     if queued["waits_for"]:
         print_message(f"it waits for: {queued['waits_for']}")
+
+
+SHOWN_EVERY = 10.0
+"""Interval at which a long check is reported [s]."""
+
+
+def _checked(client: Client, item: dict[str, Any]) -> dict[str, Any]:
+    """Wait until a campaign has been checked, and return it; Ctrl-C returns it as it is."""
+    begun = shown = time.monotonic()
+    try:
+        while item["state"] == "checking":
+            time.sleep(0.2)
+            item = client.get(f"/campaigns/{item['id']}")
+            if (now := time.monotonic()) - shown > SHOWN_EVERY:
+                shown = now
+                print_note(f"{item['id']} is being checked: vessels, motions, devices ({now - begun:.0f} s) …")
+    except KeyboardInterrupt:
+        print_message(f"the check of {item['id']} goes on: decant queue list {item['id']}")
+    return item
 
 
 def list_campaigns(key: CampaignOrAll = None, url: Url = None, state: State = None, as_json: Json = False) -> None:

@@ -91,6 +91,7 @@ def serve_app(daemon: Supervisor, tokens: Tokens, shutdown: Callable[[], None]) 
     app, settings = create_app(), daemon.shared.settings
     app.state.daemon, app.state.queue, app.state.stops = daemon.shared, daemon.queue, daemon.stops
     app.state.tokens, app.state.shutdown = tokens, shutdown
+    daemon.shared.token_problems = lambda: tokens.problems
     app.state.ordering = Ordering(daemon.shared, daemon.queue)
     app.add_middleware(RequestGuard, limit=settings.body_limit, host=settings.host, tokens=tokens)
     return app

@@ -271,7 +271,8 @@ _MASS = re.compile(r"([-+−–]?[.,]?[0-9]+(?:[.,'’][0-9]+)*\.?(?:e-?[0-9]+)?
 def _typed_masses(text: str, loaded: float) -> tuple[float, ...]:
     """Spilled and retained mass, and the load if it is there [kg], as an operator types them.
 
-    A comma between digits is a decimal sign, unless it may as well separate two masses; then the text is refused.
+    A comma between digits is a decimal sign where units or semicolons separate the masses. Otherwise it may as well
+    separate two masses, and the text is refused.
 
     Raises:
         ValueError: the text is something else, or has two meanings.
@@ -283,13 +284,13 @@ def _typed_masses(text: str, loaded: float) -> tuple[float, ...]:
     if not units and ";" not in text:
         separate = [(number, "") for listed, _ in masses for number in listed.split(",")]
         doubtful = [number for number, _ in masses if "," in number and "." not in number]
-        if doubtful and len(separate) in (2, 3):
+        if doubtful:
             readings = "".join(f"{reading}, or " for reading in number_readings(doubtful[0]))
             raise ValueError(
                 f"'{doubtful[0]}' may be {readings}the masses {' and '.join(doubtful[0].split(','))}, since a comma "
-                "may be a decimal sign; type decimal points, and a space between two masses, e.g. weighed 3.2 0.4"
+                "may be a decimal sign; type decimal points, e.g. weighed 3.2 0.4, or a semicolon: weighed 3,2; 0,4"
             )
-        masses = masses if doubtful else separate
+        masses = separate
     if len(masses) not in (2, 3):
         raise ValueError("two masses are needed, spilled and retained, e.g. weighed 3.2 0.4 (grams)")
     if units - {"g"} and not all(unit for _, unit in masses):

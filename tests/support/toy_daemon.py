@@ -122,10 +122,21 @@ class Served:
         return answer.json()
 
     async def submit(self, **changes: Any) -> str:
+        """Submit the campaign, and wait until it has been checked."""
         text, files = pack(load_campaign(self.campaign))
         found = await self.post("/campaigns", {"text": text, "files": files, **changes})
         key: str = found["id"]
+        await self.checked(key)
         return key
+
+    async def checked(self, key: str) -> dict[str, Any]:
+        """Wait until a campaign has been checked."""
+        async with asyncio.timeout(PATIENCE):
+            async for _ in self.daemon.feed.read(0, beat=0.05):
+                found: dict[str, Any] = await self.get(f"/campaigns/{key}")
+                if found["state"] != "checking":
+                    return found
+        raise AssertionError("unreachable")
 
     async def until(self, key: str, *states: str) -> dict[str, Any]:
         """Wait until a campaign is in one of these states, and nobody holds its rig if it rests there."""

@@ -13,6 +13,7 @@ import contextlib
 import json
 import re
 from collections.abc import Awaitable, Callable, MutableMapping
+from dataclasses import replace
 from typing import Annotated, Any
 
 from fastapi import Depends, HTTPException, Request, Response
@@ -35,6 +36,9 @@ Send = Callable[[Message], Awaitable[None]]
 
 BEARER = HTTPBearer(auto_error=False, description="A token of the file 'tokens' in the daemon's state directory.")
 
+
+LOCAL_USER = b"decant-user"
+"""Header with the name of a local user."""
 
 MOST_WORDS = 20
 """Words of the headers `Authorization` of a stop that are compared with the tokens."""
@@ -187,7 +191,16 @@ def stopping_person(scope: MutableMapping[str, Any], tokens: Tokens) -> Person |
     """
     lines = b",".join(value for name, value in scope["headers"] if name == b"authorization").decode("latin-1")
     people = [tokens.find(word) for word in re.split(r"[\s,]+", lines)[:MOST_WORDS]]
-    return max(filter(None, people), key=lambda person: person.role, default=None)
+    holder = max(filter(None, people), key=lambda person: person.role, default=None)
+    return None if holder is None else _named(holder, scope)
+
+
+def _named(person: Person, scope: MutableMapping[str, Any]) -> Person:
+    """A local user has the name that the command line sends; it is marked, since it is the account's own word."""
+    if not person.local:
+        return person
+    sent = next((value.decode("latin-1") for name, value in scope["headers"] if name == LOCAL_USER), "")
+    return replace(person, name=f"{sent if re.fullmatch('[A-Za-z0-9._-]{1,40}', sent) else 'somebody'} (local)")
 
 
 def needs(role: Role) -> Callable[..., Awaitable[Person]]:
@@ -211,7 +224,9 @@ def needs(role: Role) -> Callable[..., Awaitable[Person]]:
         except TooManyFailuresError as error:
             raise HTTPException(429, str(error), {"Retry-After": str(int(error.wait) + 1)}) from None
         if holder is None:
-            raise HTTPException(401, "this token is not known", {"WWW-Authenticate": "Bearer"})
+            text = "this token is not known, or has expired"
+            raise HTTPException(401, text, {"WWW-Authenticate": "Bearer"})
+        holder = _named(holder, request.scope)
         if holder.role < role:
             raise HTTPException(403, f"{holder.name} is a {holder.role.name.lower()}; this takes {role.name.lower()}")
         return holder

@@ -104,19 +104,22 @@ router = APIRouter()
 async def submit(
     daemon: Daemon, queue: Queue, orders: Orders, person: Operator, body: SubmissionIn, response: Response
 ) -> CampaignOut:
-    """Queue a campaign. It is checked as by `decant run`, and later changes of its files don't affect it.
+    """Take a campaign: it is loaded, stored with its files, checked as by `decant run`, and then queued.
 
-    Repeated with the same `id` and the same campaign, the call returns the campaign and queues nothing.
+    The response comes before the check, which may take minutes: the state is 'checking', and then 'queued', or
+    'refused' with the reason. Later changes of the campaign's files don't affect it. Repeated with the same `id` and
+    the same content, the call returns the campaign and queues nothing; a refused campaign frees its id for another one.
     """
     if bool(body.text) == bool(body.path) or (body.path and body.files):
         raise HTTPException(422, "give either 'text' (with 'files') or 'path'")
-    if daemon.store.by_caller_id(body.id) is not None:
-        response.status_code = 200
     with _refusing():
         try:
-            return campaign_out(daemon, queue, await orders.campaign(body, person.name))
+            item, new = await orders.campaign(body, person.name)
         except SubmissionError as error:
             raise HTTPException(422, str(error)) from None
+    if not new:
+        response.status_code = 200
+    return campaign_out(daemon, queue, item)
 
 
 @router.post("/campaigns/{key}/pause", operation_id="pause")

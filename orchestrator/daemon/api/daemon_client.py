@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import getpass
 import json
 import os
 import re
@@ -20,7 +21,7 @@ from pydantic import ValidationError
 
 from orchestrator.daemon import PHYSICAL, PORT
 from orchestrator.daemon.rigs.pour_request import PourIn, problems_text
-from orchestrator.daemon.state.access_tokens import Role, token_of
+from orchestrator.daemon.state.access_tokens import LOCAL, local_token
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.run_registry import state_directory
 
@@ -28,6 +29,9 @@ V1 = "/api/v1"
 TIMEOUT = httpx.Timeout(60.0, connect=5.0)
 STOP_TIMEOUT = httpx.Timeout(8.0, connect=5.0)
 """Of an emergency stop: longer than the daemon waits for an arm that does not confirm it."""
+
+SUBMISSIONS = 3
+"""Number of times that a submission is sent if no response comes."""
 
 LONGEST_SENT = 2000
 """Characters of a reason or a rig that are sent with an emergency stop; the daemon records fewer."""
@@ -38,11 +42,12 @@ class DaemonError(RunError):
 
     Attributes:
         unreachable: the connection failed, so the call may or may not have been executed.
+        timed_out: the daemon was reached, and did not respond in time.
     """
 
-    def __init__(self, text: str, exit_code: int = 1, *, unreachable: bool = False) -> None:
+    def __init__(self, text: str, exit_code: int = 1, *, unreachable: bool = False, timed_out: bool = False) -> None:
         super().__init__(text)
-        self.exit_code, self.unreachable = exit_code, unreachable
+        self.exit_code, self.unreachable, self.timed_out = exit_code, unreachable, timed_out
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,8 @@ class Client:
         url: URL of the daemon; by default $DECANT_URL, the URL in the state directory, or the default port of this
             machine.
         state: the daemon's state directory, which contains the tokens.
-        token: bearer token; by default $DECANT_TOKEN, or one of the tokens in the state directory.
+        token: bearer token; by default $DECANT_TOKEN, or the local one in the state directory: then the user's own name
+            is recorded, as '… (local)'.
 
     Raises:
         DaemonError: no token was found.
@@ -87,8 +93,9 @@ class Client:
         state = state or state_directory()
         self.url = (url or os.environ.get("DECANT_URL") or _stored_url(state) or f"http://127.0.0.1:{PORT}").rstrip("/")
         token = token or os.environ.get("DECANT_TOKEN") or _token(state)
+        headers = {"Authorization": f"Bearer {token}", "Decant-User": _user()}
         self._http = httpx.Client(
-            base_url=self.url, headers={"Authorization": f"Bearer {token}"}, timeout=TIMEOUT, trust_env=False,
+            base_url=self.url, headers=headers, timeout=TIMEOUT, trust_env=False,
             verify=_trusted(self.url),
         )  # fmt: skip
 
@@ -109,6 +116,16 @@ class Client:
     def post(self, path: str, body: Any = None) -> Any:
         """Send a command with POST."""
         return self._call("POST", path, json=body).json()
+
+    def submit(self, body: dict[str, Any]) -> Any:
+        """Submit a campaign that has an id of its caller; a call without a response is repeated with the same id."""
+        for _ in range(SUBMISSIONS - 1):
+            try:
+                return self.post("/campaigns", body)
+            except DaemonError as error:
+                if not error.timed_out:
+                    raise
+        return self.post("/campaigns", body)
 
     def emergency_stop(self, reason: str = "", rig: str = "") -> Any:
         """Stop every arm, or that of one rig. Neither reason nor rig prevents the stop; the server reports in notes.
@@ -143,6 +160,12 @@ class Client:
             return DaemonError(
                 f"the certificate of {self.url} is not believed ({error}); name the authority that signed "
                 "it, or itself where it signed itself, in $DECANT_CA"
+            )
+        if isinstance(error, httpx.ReadTimeout | httpx.WriteTimeout | httpx.PoolTimeout):
+            return DaemonError(
+                f"the daemon at {self.url} was reached and did not respond in time; it may have executed the call",
+                unreachable=True,
+                timed_out=True,
             )
         return DaemonError(
             f"no daemon answers at {self.url} ({error}); start one with 'decant server start', or say where it is: "
@@ -245,15 +268,20 @@ def _stored_url(state: Path) -> str | None:
 
 
 def _token(state: Path) -> str:
-    path = state / "tokens"
-    try:
-        token = token_of(path, Role.ADMIN) or token_of(path, Role.VIEWER) if path.exists() else None
-    except PermissionError:  # the daemon of another user, such as a service
-        token = None
-    if token is None:
+    if (token := local_token(state)) is None:  # no daemon was started there, or it is another user's, such as a service
         raise DaemonError(
-            f"no token: {path} does not exist or belongs to another user. Set $DECANT_TOKEN to a token that the "
-            "daemon's administrator gives you, or name the state directory of your own daemon (--state, $DECANT_STATE)",
+            f"no token: {state / LOCAL} does not exist or belongs to another user. Set $DECANT_TOKEN to a token that "
+            "the daemon's administrator gives you ('decant server token add'), or name the state directory of your own "
+            "daemon (--state, $DECANT_STATE)",
             2,
         )
     return token
+
+
+def _user() -> str:
+    """Name of the user who runs this program, as far as it fits into a header."""
+    try:
+        name = getpass.getuser()
+    except (KeyError, OSError):  # an account without a name
+        name = f"uid-{os.getuid()}"
+    return re.sub("[^A-Za-z0-9._-]", "_", name)[:40]

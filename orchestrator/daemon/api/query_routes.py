@@ -46,7 +46,7 @@ router = APIRouter()
 
 @router.get("/status", operation_id="status")
 async def status(daemon: Daemon, stops: Stops, person: Viewer) -> StatusOut:
-    """Return the state of the daemon."""
+    """Return the state of the daemon, and who asks."""
     return StatusOut.model_validate(
         {
             "version": importlib.metadata.version(DISTRIBUTION),
@@ -54,7 +54,8 @@ async def status(daemon: Daemon, stops: Stops, person: Viewer) -> StatusOut:
             "began": daemon.began,
             "stopping": daemon.stopping,
             "ready": daemon.warm.ready and not daemon.problems and not daemon.stopping,
-            "problems": list(daemon.problems.values()),
+            "problems": [*daemon.problems.values(), *daemon.token_problems()],
+            "person": {"name": person.name, "role": person.role.name.lower()},
             "queue_paused": daemon.queue_paused,
             "emergency": stops.of_all,
             "simulators": daemon.warm.size,

@@ -101,8 +101,8 @@ class CampaignOut(ResponseModel):
 
     priority: int
     state: str
-    """One of: queued, preparing, running, pausing, paused, waiting for operator, stopping, finished, failed, unknown,
-    stopped, withdrawn.
+    """One of: checking, refused, queued, preparing, running, pausing, paused, waiting for operator, stopping, finished,
+    failed, unknown, stopped, withdrawn.
     """
 
     desired_state: str
@@ -222,6 +222,13 @@ class WhatMovesOut(ResponseModel):
     lines: list[str]
 
 
+class PersonOut(ResponseModel):
+    """The holder of the request's token."""
+
+    name: str
+    role: Literal["viewer", "operator", "admin"]
+
+
 class StatusOut(ResponseModel):
     """State of the daemon."""
 
@@ -247,6 +254,8 @@ class StatusOut(ResponseModel):
 
     last_event: int
     live: str | None
+    person: PersonOut
+    """Who asks, and what they may do."""
 
 
 class StoppedOut(StatusOut):

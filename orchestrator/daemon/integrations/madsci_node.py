@@ -58,6 +58,7 @@ _CAMPAIGN_STATUS = {
     "unknown": "unknown",
     "stopped": "cancelled",
     "withdrawn": "cancelled",
+    "refused": "failed",
 }
 """The same for a campaign."""
 

@@ -500,7 +500,7 @@ def _has_ended(state: dict[str, Any]) -> bool:
     match state["state"]:
         case "weighed" | "finished":
             return True
-        case "failed":
+        case "failed" | "refused":
             raise OrderFailedError(state["reason"] or f"{state['id']} has failed")
         case "cancelled":
             raise OrderCancelledError(state["reason"] or f"{state['id']} was cancelled")

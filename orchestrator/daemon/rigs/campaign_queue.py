@@ -6,7 +6,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import logging
 import secrets
+import shutil
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,13 +18,50 @@ from datetime import datetime
 
 from orchestrator.daemon.rigs.emergency_stop import EmergencyStops
 from orchestrator.daemon.rigs.rig_worker import SharedServices
-from orchestrator.daemon.state.daemon_store import ENDED, PAUSED, STOPPED, WITHDRAWN, DesiredState, QueueItem
+from orchestrator.daemon.rigs.submissions import SubmissionError, check
+from orchestrator.daemon.state.daemon_store import (
+    CHECKING,
+    ENDED,
+    PAUSED,
+    REFUSED,
+    STOPPED,
+    WITHDRAWN,
+    DesiredState,
+    QueueItem,
+)
 from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.stages import POUR
+
+_log = logging.getLogger(__name__)
 
 
 class RequestRefusedError(RunError):
     """The request can't be fulfilled now; the message gives the reason."""
+
+
+CHECKS = 2
+"""Number of campaigns that are checked at a time."""
+
+
+async def _in_thread(work: Callable[[], None]) -> None:
+    """Do work in a thread that the end of the program does not wait for."""
+    loop, done = asyncio.get_running_loop(), asyncio.get_running_loop().create_future()
+
+    def settle(error: BaseException | None) -> None:
+        if not done.done():
+            done.set_result(None) if error is None else done.set_exception(error)
+
+    def run() -> None:
+        error: BaseException | None = None
+        try:
+            work()
+        except BaseException as raised:
+            error = raised
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            loop.call_soon_threadsafe(settle, error)
+
+    threading.Thread(target=run, name="check", daemon=True).start()
+    await done
 
 
 class CampaignQueue:
@@ -33,6 +74,8 @@ class CampaignQueue:
 
     def __init__(self, shared: SharedServices, stops: EmergencyStops) -> None:
         self._shared, self._store, self._stops = shared, shared.store, stops
+        self._checks: set[asyncio.Task[None]] = set()
+        self._free_check = asyncio.Semaphore(CHECKS)
 
     def new_key(self) -> str:
         """Return a random key that no campaign's id ends with."""
@@ -42,7 +85,7 @@ class CampaignQueue:
                 return key
 
     def submit(self, item: QueueItem, enter: Callable[[], None] = lambda: None) -> QueueItem:
-        """Queue a campaign whose snapshot has been checked.
+        """Queue a campaign whose snapshot is stored; one that is not checked yet is checked first.
 
         Args:
             item: the campaign.
@@ -58,8 +101,43 @@ class CampaignQueue:
             self._store.add(queued)
             enter()
         self._shared.note(item.by, "submit", item.id)
+        if queued.state == CHECKING:
+            self.check(queued)
         self._shared.wake()
         return queued
+
+    def check(self, item: QueueItem) -> None:
+        """Start the check of a received campaign; it is then queued, or refused with the reason."""
+        task = asyncio.create_task(self._check(item), name=f"check {item.id}")
+        self._checks.add(task)
+        task.add_done_callback(self._checks.discard)
+
+    async def _check(self, item: QueueItem) -> None:
+        state, reason = "queued", ""
+        async with self._free_check:
+            try:
+                await _in_thread(lambda: check(self._shared.settings, item))
+            except SubmissionError as error:
+                state, reason = REFUSED, str(error)
+            except Exception as error:
+                _log.exception("the check of %s failed", item.id)
+                state, reason = REFUSED, f"the check failed: {type(error).__name__}: {error}"
+        now = self.item(item.id)
+        if state == REFUSED and now.run is None:
+            self._store.change(item.id, state=state, reason=reason, ended=time.time())
+            snapshot = self._shared.settings.snapshots / item.id
+            await asyncio.to_thread(shutil.rmtree, snapshot, ignore_errors=True)
+        elif now.state == CHECKING:
+            state = "queued" if now.desired_state == DesiredState.RUN else "paused"
+            self._store.change(item.id, state=state)
+        self._shared.feed.publish("CampaignChecked", {"state": state, "reason": reason}, item.id)
+        self._shared.wake()
+
+    async def close(self) -> None:
+        """End all checks; they begin again when the daemon starts."""
+        for task in self._checks:
+            task.cancel()
+        await asyncio.gather(*self._checks, return_exceptions=True)
 
     def refuse_new_work(self, rig: str = "") -> None:
         """Raise RequestRefusedError if the daemon or one rig accepts no new work."""
@@ -144,10 +222,10 @@ class CampaignQueue:
         self._store.change(item.id, desired_state=str(desired))
         self._shared.note(by, str(desired), item.id)
         if running is None:
-            if item.state == "queued":
-                self._store.change(
-                    item.id, state=WITHDRAWN if desired is DesiredState.STOP else "paused", reason=f"by {by}"
-                )
+            if item.state in ("queued", CHECKING):
+                if desired is DesiredState.STOP or item.state == "queued":
+                    state = WITHDRAWN if desired is DesiredState.STOP else "paused"
+                    self._store.change(item.id, state=state, reason=f"by {by}")
             elif desired is DesiredState.STOP:
                 self._store.change(item.id, state=STOPPED, ended=time.time(), reason=f"by {by}")
                 if item.task == POUR and (worker := self._shared.workers.get(item.rig)) is not None:
@@ -176,6 +254,8 @@ class CampaignQueue:
             return f"an operator has to answer question {question.id} {where}: {question.text}"
         if item.state in ENDED or (worker is not None and worker.holds(item.id)):
             return ""
+        if item.state == CHECKING:
+            return "its check: the vessels, the motions and the devices"
         if worker is None:
             return f"an administrator has to add rig {item.rig} to the daemon's settings again"
         if self._stops.holds(item.rig):
@@ -201,8 +281,10 @@ class CampaignQueue:
         self.refuse_new_work(item.rig)
         if item.state in (STOPPED, WITHDRAWN) and item.run is None:
             self._store.change(item.id, state="queued", desired_state=str(DesiredState.RUN), reason="")
-        elif self._shared.running(item) is not None or item.state in ("queued", "finished"):
+        elif self._shared.running(item) is not None or item.state in ("queued", "finished", REFUSED):
             raise RequestRefusedError(f"{item.id} is {item.state}; it can be resumed when it is paused")
+        elif item.state == CHECKING:
+            self._store.change(item.id, desired_state=str(DesiredState.RUN))
         else:
             state = "queued" if item.run is None else "paused" if item.state == STOPPED else item.state
             self._store.change(item.id, state=state, desired_state=str(DesiredState.RUN), ended=None)

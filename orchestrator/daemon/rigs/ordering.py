@@ -8,7 +8,6 @@ of its own, so a caller that disconnects does not interrupt it.
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import shutil
 import time
 from collections.abc import Callable, Coroutine
@@ -21,8 +20,8 @@ from orchestrator.daemon.rigs.materials import SURE, Materials
 from orchestrator.daemon.rigs.pour_orders import OrderBook, OrderError, PourOrder, carried_cup, settled_pour
 from orchestrator.daemon.rigs.pour_request import PourIn, SubmissionIn
 from orchestrator.daemon.rigs.rig_worker import SharedServices
-from orchestrator.daemon.rigs.submissions import Submission, planned_order, prepare
-from orchestrator.daemon.state.daemon_store import QueueItem
+from orchestrator.daemon.rigs.submissions import Submission, planned_order, prepare, receive
+from orchestrator.daemon.state.daemon_store import REFUSED, QueueItem
 from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.stages import POUR
 
@@ -72,34 +71,41 @@ class Ordering:
             )
         return await self.pour_out(request.id)
 
-    async def campaign(self, request: SubmissionIn, by: str) -> QueueItem:
-        """Check and queue a campaign, or return the one that the same request with the same id has queued already.
+    async def campaign(self, request: SubmissionIn, by: str) -> tuple[QueueItem, bool]:
+        """Take a campaign to be checked and queued, or return the one that the same content with the same id made.
 
         Args:
             request: the campaign; without an id, every call queues one.
             by: who submits it.
 
+        Returns:
+            The campaign, and whether this request made it.
+
         Raises:
-            SubmissionError: the campaign can't be run.
+            SubmissionError: the campaign can't be loaded.
             RequestRefusedError: no new work is accepted, or the id belongs to another campaign.
         """
-        key, digest = self._queue.new_key(), hashlib.sha256(request.model_dump_json().encode()).hexdigest()
-        name = f"campaign {request.id or key}"
-        item = await self._once(name, lambda: self._place_campaign(request, key, digest, by))
-        if item.body_hash != digest:
-            raise RequestRefusedError(
-                f"id {request.id} belongs to another campaign, {item.id}; give every campaign an id of its own. "
-                "Nothing was queued"
-            )
-        return item
+        key = self._queue.new_key()
+        return await self._once(f"campaign {key}", lambda: self._place_campaign(request, key, by))
 
-    async def _place_campaign(self, request: SubmissionIn, key: str, digest: str, by: str) -> QueueItem:
-        if (known := self._daemon.store.by_caller_id(request.id)) is not None:
-            return known
-        self._queue.refuse_new_work()
+    async def _place_campaign(self, request: SubmissionIn, key: str, by: str) -> tuple[QueueItem, bool]:
+        if self._daemon.store.by_caller_id(request.id) is None:
+            self._queue.refuse_new_work()
         submission = Submission(**request.model_dump(exclude={"id"}))
-        item = await asyncio.to_thread(prepare, self._daemon.settings, submission, key, by)
-        return await self._enqueue(replace(item, caller_id=request.id, body_hash=digest))
+        item = await asyncio.to_thread(receive, self._daemon.settings, submission, key, by)
+        earlier = self._daemon.store.by_caller_id(request.id)
+        if earlier is not None:
+            if earlier.body_hash == item.body_hash:
+                await self._forget(item)
+                return earlier, False
+            if earlier.state != REFUSED:
+                await self._forget(item)
+                raise RequestRefusedError(
+                    f"id {request.id} belongs to another campaign, {earlier.id}; give every campaign an id of its own. "
+                    "Nothing was queued"
+                )
+            self._daemon.store.change(earlier.id, caller_id="")
+        return await self._enqueue(replace(item, caller_id=request.id)), True
 
     async def _once(self, key: str, work: Callable[[], Coroutine[Any, Any, Placed]]) -> Placed:
         """Do the same work once for all who ask for it while it lasts; a caller that leaves does not end it."""

@@ -180,10 +180,11 @@ class SubmissionIn(RequestModel):
     """A campaign: `text` with its `files`, or the `path` of a file on the daemon's machine."""
 
     text: str = Field(default="", max_length=500_000)
-    """The campaign as YAML. Its paths refer to `files`."""
+    """The campaign as YAML. Its paths refer to `files`. Without `laboratory`, it runs on the rig."""
 
     files: dict[str, str] = Field(default_factory=dict)
-    """Files that the campaign refers to: relative path → content in base64."""
+    """Files that the campaign and its files refer to: path from the campaign's file, such as '../vessels/beaker.yaml' →
+    content in base64."""
 
     path: str = Field(default="", max_length=1000)
     """Instead of `text` and `files`: a file in one of the folders that the daemon's settings list as roots."""

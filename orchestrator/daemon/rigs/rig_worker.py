@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -58,6 +58,7 @@ class SharedServices:
     Attributes:
         workers: the rig workers, by the names of their rigs.
         problems: problems for the operator, by subject.
+        token_problems: returns those of the token file.
         stopping: whether nothing starts any more.
         rested: set when a campaign comes to rest; the charts of the laboratories are then read.
         suspect: whether the simulators may have failed for good: they are restarted when no campaign uses them.
@@ -76,6 +77,7 @@ class SharedServices:
         )
         self.workers = {rig.name: RigWorker(self, rig) for rig in (*settings.rigs, Rig(NO_RIG))}
         self.problems: dict[str, str] = {}
+        self.token_problems: Callable[[], list[str]] = list
         self.notification_counts: dict[str, Counts] = {}
         self.pours = Pours()
         self.stopping = self.suspect = False

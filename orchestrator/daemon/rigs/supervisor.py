@@ -19,6 +19,7 @@ from orchestrator.daemon.rigs.emergency_stop import EmergencyStops
 from orchestrator.daemon.rigs.pour_orders import OrderBook
 from orchestrator.daemon.rigs.rig_worker import SharedServices
 from orchestrator.daemon.state.daemon_settings import DaemonSettings
+from orchestrator.daemon.state.daemon_store import CHECKING
 from orchestrator.daemon.state.run_readout import violated_charts
 from orchestrator.live_view.live_server import LiveView
 
@@ -62,6 +63,8 @@ class Supervisor:
             # without a run nothing has begun: it is in the queue again
             shared.store.change(item.id, state="paused" if item.run is not None else "queued", reason=reason)
             shared.feed.publish("CampaignFound", {"state": item.state, "text": reason}, item.id)
+        for item in shared.store.items([CHECKING]):
+            self.queue.check(item)
         for key in OrderBook(shared.store).begun():
             item = self.queue.item(key)
             if (worker := shared.workers.get(item.rig)) is not None:
@@ -149,6 +152,7 @@ class Supervisor:
         shared = self.shared
         shared.stopping = True
         await asyncio.gather(*(worker.close() for worker in shared.workers.values()))
+        await self.queue.close()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)

@@ -111,10 +111,13 @@ PAUSED = "paused"
 STOPPED, WITHDRAWN = "stopped", "withdrawn"
 """States of a campaign in addition to those of its run: ended by an operator, after or before its run started."""
 
-AT_REST = ("queued", "paused", "unknown", "failed", "finished", STOPPED, WITHDRAWN)
+CHECKING, REFUSED = "checking", "refused"
+"""States of a campaign before it is queued: its check runs, or has ended with an error that the reason has."""
+
+AT_REST = ("queued", "paused", "unknown", "failed", "finished", STOPPED, WITHDRAWN, REFUSED)
 """States in which a campaign may rest; any other state found at the start means that the daemon crashed."""
 
-ENDED = ("finished", STOPPED, WITHDRAWN)
+ENDED = ("finished", STOPPED, WITHDRAWN, REFUSED)
 """Final states."""
 
 
@@ -129,7 +132,7 @@ class QueueItem:
         mode: mode of that rig: 'virtual', 'hardware' or 'none'.
         priority: higher priorities run first.
         rank: order within one priority, smallest first.
-        state: state of the run (`orchestrator.records.states`), or 'stopped', 'withdrawn'.
+        state: state of the run (`orchestrator.records.states`), or 'checking', 'refused', 'stopped', 'withdrawn'.
         desired_state: desired state.
         reason: reason of the state, for the operator.
         by: user who submitted it.
@@ -301,10 +304,9 @@ class Store:
         return [_item(row) for row in rows]
 
     def active(self) -> list[QueueItem]:
-        """Return the campaigns that are in no state of rest."""
-        return [
-            _item(row) for row in self._db.execute(f"select * from campaign where state not in ({_quoted(AT_REST)})")
-        ]
+        """Return the campaigns that are in no state of rest, and not being checked."""
+        states = _quoted((*AT_REST, CHECKING))
+        return [_item(row) for row in self._db.execute(f"select * from campaign where state not in ({states})")]
 
     def wanted(self, rig: str) -> list[QueueItem]:
         """Return the campaigns of a rig that rest, have not ended and should run: the queue in its order first."""

@@ -48,6 +48,7 @@ PRESENT = 600.0
 """Time after an answer in which a person is expected to see further questions on the page [s]."""
 
 _EVENTS_WITH_DATA = (
+    "CampaignChecked",
     "CampaignLeased",
     "CampaignOpened",
     "CampaignRests",
@@ -191,6 +192,8 @@ class Notifier:
                     news.told, news.answered = False, self._clock()
                     if question.get("about") == "unattended" and question.get("answer") == "yes":
                         news.unattended, news.answered = True, -math.inf
+            case "CampaignChecked" if data["state"] == "refused":
+                return self._made("failed", campaign, "is refused", [str(data["reason"])])
             case "CampaignRests":
                 message = self._rests(data, campaign)
                 self._news.pop(campaign, None)

@@ -13,7 +13,7 @@ import time
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from orchestrator.daemon.state.daemon_store import ENDED, PAUSED, DesiredState, Store, StoreError
+from orchestrator.daemon.state.daemon_store import CHECKING, ENDED, PAUSED, DesiredState, Store, StoreError
 from orchestrator.materials.vessel_account import FILE_NAME as ACCOUNT
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_check import LEDGER_NAME
@@ -144,7 +144,7 @@ def restore(source: Path, state: Path) -> dict[str, float]:
     store = Store(state / STORE)
     try:
         store.set_flag(PAUSED, {"by": "restore", "time": time.time()})
-        resting = (*ENDED, "queued")
+        resting = (*ENDED, CHECKING, "queued")
         store.write(
             f"update campaign set desired_state = ? where state not in ({', '.join('?' * len(resting))})",
             *(str(DesiredState.PAUSE), *resting),

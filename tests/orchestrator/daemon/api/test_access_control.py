@@ -12,16 +12,29 @@ import os
 import socket
 import stat
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
+from typer.testing import CliRunner
 
 from orchestrator.catalogue.catalogue import Catalogue
+from orchestrator.cli.app import app
 from orchestrator.daemon.api.access_control import DRAIN
+from orchestrator.daemon.api.daemon_client import Client
 from orchestrator.daemon.rigs.submissions import SubmissionBundleError, unpack
-from orchestrator.daemon.state.access_tokens import FAILURES, WINDOW, Role, TokenFileError, Tokens, TooManyFailuresError
+from orchestrator.daemon.state.access_tokens import (
+    FAILURES,
+    WINDOW,
+    Role,
+    TokenFileError,
+    Tokens,
+    TooManyFailuresError,
+    token_of,
+)
 from orchestrator.records.run_registry import enter
 from tests.support.browser import on_port
 from tests.support.toy_daemon import Served, held, run, serving
@@ -113,10 +126,98 @@ def test_tokens_are_made_once_for_their_owner_alone_and_refused_where_others_can
     path.chmod(0o640)
     with pytest.raises(TokenFileError, match="others may read the tokens"):
         Tokens(path)
+
+
+def test_a_bad_line_has_no_effect_and_the_others_have_theirs(tmp_path: Path) -> None:
+    path = tmp_path / "tokens"
+    tokens = Tokens(path)
+    good = token_of(path, Role.OPERATOR) or ""
+    text, secret = path.read_text(), "Geheimes-Wort"
+    bad = [f"operator tablet {secret}", f"chief tablet {secret * 2}", f"viewer a b {secret * 2}", "viewer a sha256:12"]
+    path.write_text(text + "\n".join([*bad, f"viewer late {secret * 2} until=tomorrow"]) + "\n")
+    assert tokens.find(good) is not None
+    assert [problem.partition(": ")[0] for problem in tokens.problems] == [f"tokens:{line}" for line in range(5, 10)]
+    assert "decant server token add" in tokens.problems[0]
+    assert secret not in "".join(tokens.problems)
+    assert Tokens(path).find(good) is not None
+
+
+def test_tokens_are_added_expired_and_revoked_while_the_daemon_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            state = ["--state", str(served.daemon.settings.state)]
+
+            def token(*arguments: str, code: int = 0) -> str:
+                result = CliRunner().invoke(app, ["server", "token", *arguments, *state])
+                assert result.exit_code == code, result.output
+                return result.stdout.strip() or result.stderr
+
+            async def status(secret: str) -> httpx.Response:
+                return await served.http.get("/api/v1/status", headers={"Authorization": f"Bearer {secret}"})
+
+            anna, screen = token("add", "operator", "anna"), token("add", "viewer", "screen", "--days", "2")
+            assert (await status(anna)).json()["person"] == {"name": "anna", "role": "operator"}
+            assert (await status(screen)).json()["person"] == {"name": "screen", "role": "viewer"}
+            assert "revoke it first" in token("add", "viewer", "anna", code=2)
+            assert "is no name" in token("add", "viewer", "an na", code=2)
+            text = served.daemon.settings.tokens.read_text()
+            assert anna not in text
+            assert "sha256:" in text
+            shown = token("list")
+            assert "operator  anna" in shown
+            assert "in plain text" in shown.splitlines()[0]
+            now = time.time()
+            with monkeypatch.context() as later:
+                later.setattr("orchestrator.daemon.state.access_tokens.time.time", lambda: now + 3 * 86_400)
+                assert (await status(screen)).status_code == 401
+                assert (await status(anna)).status_code == 200
+            token("revoke", "anna")
+            assert (await status(anna)).status_code == 401
+            assert "there is no token of anna" in token("revoke", "anna", code=2)
+            with served.daemon.settings.tokens.open("a") as file:
+                file.write("operator tablet short\n")
+            problems = (await served.get("/status"))["problems"]
+            assert any("this line has no effect" in problem for problem in problems)
+
+    run(work())
+
+
+def test_a_file_that_others_may_read_by_now_changes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "tokens"
+    tokens = Tokens(path)
+    good = token_of(path, Role.VIEWER) or ""
+    path.chmod(0o644)
+    assert tokens.find(good) is not None
+    assert "others may read the tokens" in tokens.problems[0]
     path.chmod(0o600)
-    path.write_text(text + "operator tablet short\n")
-    with pytest.raises(TokenFileError, match=r"tokens:5: should be ROLE NAME TOKEN"):
-        Tokens(path)
+    assert tokens.find(good) is not None
+    assert tokens.problems == []
+
+
+def test_the_local_command_line_acts_as_the_local_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DECANT_TOKEN", raising=False)
+    monkeypatch.setenv("LOGNAME", "ada")
+
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            state = served.daemon.settings.state
+            with (state / "tokens").open("a") as file:
+                file.write(f"admin boss {'x' * 30}\n")
+            with Client("http://127.0.0.1:1", state) as client:
+                headers = client._http.headers
+            for name, recorded in (("ada", "ada (local)"), ("a\nb", "somebody (local)")):
+                sent = {"Authorization": headers["Authorization"], "Decant-User": name.replace("\n", " ")}
+                answer = await served.http.post("/api/v1/queue/pause", headers=sent)
+                assert answer.json()["person"] == {"name": recorded, "role": "admin"}
+                assert served.daemon.store.audit(limit=1)[0]["by"] == recorded
+            assert headers["Decant-User"] == "ada"
+            # the header of somebody with a token of their own changes nothing
+            sent = {**served.headers(Role.OPERATOR), "Decant-User": "boss"}
+            assert (await served.http.get("/api/v1/status", headers=sent)).json()["person"]["name"] == "operator"
+
+    run(work())
 
 
 def first_run(state: Path) -> None:
@@ -178,7 +279,20 @@ def test_what_is_submitted_neither_looks_elsewhere_nor_blows_up(tmp_path: Path, 
 
 
 @pytest.mark.parametrize(
-    "name", ["../x", "/etc/x", "a/../../x", "a//b", ".hidden", "campaign.yaml", "a\x00b", "x" * 200, ""]
+    "name",
+    [
+        "../../../../x",
+        "a/../x",
+        "../campaign/campaign.yaml",
+        "/etc/x",
+        "a/../../x",
+        "a//b",
+        ".hidden",
+        "campaign.yaml",
+        "a\x00b",
+        "x" * 200,
+        "",
+    ],
 )
 def test_files_go_nowhere_but_into_the_snapshot(tmp_path: Path, name: str) -> None:
     with pytest.raises(SubmissionBundleError, match="is not a name for one"):

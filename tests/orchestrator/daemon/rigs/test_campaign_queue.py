@@ -10,12 +10,14 @@ import gc
 import json
 import re
 import socket
+import threading
 import time
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import httpx
 import pytest
 from pydantic import ValidationError
 from typer.testing import CliRunner
@@ -24,6 +26,7 @@ from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
 from orchestrator.cli import queue_commands
 from orchestrator.cli.app import app
 from orchestrator.cli.queue_commands import submit
+from orchestrator.daemon.api.daemon_client import Client
 from orchestrator.daemon.rigs.pour_request import SubmissionIn
 from orchestrator.daemon.rigs.submissions import Submission, SubmissionError, pack, prepare, run_request
 from orchestrator.daemon.state.daemon_settings import NO_RIG, DaemonSettings, Rig
@@ -34,6 +37,7 @@ from orchestrator.runs.run_service import RunHandle, RunRequest
 from sim_engine.prediction_band import CalibrationResidual
 from tests.support.small_campaign import NARROW, write_campaign
 from tests.support.toy_daemon import CAMPAIGN, HeldLaboratory, campaign_in, held, run, serving
+from tests.support.waiting import PATIENCE
 
 
 def test_submitted_campaigns_run_to_their_end_one_after_the_other(tmp_path: Path) -> None:
@@ -211,9 +215,9 @@ def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_p
     sent: dict[str, Any] = {}
 
     class Told:
-        def post(self, path: str, body: Any) -> dict[str, Any]:
+        def submit(self, body: Any) -> dict[str, Any]:
             sent.update(body)
-            return {"id": "x", "rig": "none", "waits_for": ""}
+            return {"id": "x", "state": "queued", "rig": "none", "waits_for": ""}
 
     monkeypatch.setattr(
         "orchestrator.cli.queue_commands.connected_client", lambda url, state: contextlib.nullcontext(Told())
@@ -270,9 +274,9 @@ def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp
     sent: list[dict[str, Any]] = []
 
     class Client:
-        def post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
+        def submit(self, body: dict[str, Any]) -> dict[str, Any]:
             sent.append(body)
-            return {"id": "risky-1", "rig": "none", "waits_for": ""}
+            return {"id": "risky-1", "state": "queued", "rig": "none", "waits_for": ""}
 
     @contextlib.contextmanager
     def connected(url: Any, state: Any) -> Any:
@@ -411,3 +415,169 @@ def test_an_earliest_start_in_milliseconds_is_refused_with_both_readings() -> No
     with pytest.raises(ValidationError, match=text):
         SubmissionIn.model_validate({"not_before": 1000 * now})
     assert SubmissionIn.model_validate({"not_before": now + 60}).not_before == now + 60
+
+
+def _held_check(monkeypatch: pytest.MonkeyPatch, go: threading.Event, error: str = "") -> list[str]:
+    """Checks that wait until the test lets them go on."""
+    begun: list[str] = []
+
+    def check(settings: DaemonSettings, item: QueueItem) -> None:
+        begun.append(item.id)
+        assert go.wait(PATIENCE)
+        if error:
+            raise SubmissionError(error)
+
+    monkeypatch.setattr("orchestrator.daemon.rigs.campaign_queue.check", check)
+    return begun
+
+
+def test_a_submission_is_answered_before_its_check_and_then_queued(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go = threading.Event()
+    begun = _held_check(monkeypatch, go)
+
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            text, files = pack(load_campaign(served.campaign))
+            body = {"id": "rack-1", "text": text, "files": files}
+            first = await served.post("/campaigns", body, status=201)
+            assert first["state"] == "checking"
+            assert first["waits_for"].startswith("its check")
+            again = await served.post("/campaigns", body, status=200)
+            assert again["id"] == first["id"]
+            go.set()
+            await served.until(first["id"], "finished")
+            assert begun == [first["id"]]
+
+    run(work())
+
+
+def test_what_the_check_finds_is_the_reason_of_a_refused_campaign_whose_id_is_free_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go = threading.Event()
+    go.set()
+    _held_check(monkeypatch, go, "cups touch: x_offset ≥ 88 mm would clear it")
+
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            text, files = pack(load_campaign(served.campaign))
+            body = {"id": "rack-1", "text": text, "files": files}
+            key = (await served.post("/campaigns", body))["id"]
+            refused = await served.checked(key)
+            assert refused["state"] == "refused"
+            assert refused["reason"] == "cups touch: x_offset ≥ 88 mm would clear it"
+            assert refused["ended"] is not None
+            assert not (served.daemon.settings.snapshots / key).exists()
+            assert (await served.post("/campaigns", body, status=200))["id"] == key
+            told = await served.post(f"/campaigns/{key}/resume", status=409)
+            assert "is refused" in told["detail"]
+            _held_check(monkeypatch, go)
+            other = await served.post(
+                "/campaigns", {**body, "text": text.replace('"seed": 3', '"seed": 4')}, status=201
+            )
+            assert other["id"] != key
+            await served.until(other["id"], "finished")
+
+    run(work())
+
+
+def test_a_check_that_the_daemon_s_end_interrupts_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    never = threading.Event()
+    _held_check(monkeypatch, never)
+    keys: list[str] = []
+
+    async def begin() -> None:
+        async with serving(tmp_path) as served:
+            text, files = pack(load_campaign(served.campaign))
+            keys.append((await served.post("/campaigns", {"text": text, "files": files}))["id"])
+
+    async def go_on() -> None:
+        async with serving(tmp_path) as served:
+            await served.until(keys[0], "finished")
+
+    try:
+        run(begin())
+        monkeypatch.undo()
+        run(go_on())
+    finally:
+        never.set()
+
+
+def test_a_campaign_that_is_stopped_during_its_check_stays_withdrawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go = threading.Event()
+    _held_check(monkeypatch, go)
+
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            text, files = pack(load_campaign(served.campaign))
+            stopped, paused = [
+                (await served.post("/campaigns", {"text": text, "files": files}))["id"] for _ in range(2)
+            ]
+            await served.post(f"/campaigns/{stopped}/stop")
+            await served.post(f"/campaigns/{paused}/pause")
+            go.set()
+            await served.until(paused, "paused")
+            assert (await served.get(f"/campaigns/{stopped}"))["state"] == "withdrawn"
+            await served.post(f"/campaigns/{paused}/resume")
+            await served.until(paused, "finished")
+
+    run(work())
+
+
+def test_the_same_content_by_another_path_or_as_text_is_the_same_campaign(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        write_campaign(tmp_path / folder, CAMPAIGN).rename(tmp_path / folder / f"{folder}.yaml")
+
+    async def work() -> None:
+        async with serving(tmp_path, roots=(tmp_path,)) as served:
+            await served.post("/queue/pause")
+            first = await served.post("/campaigns", {"id": "x", "path": "a/a.yaml"}, status=201)
+            second = await served.post("/campaigns", {"id": "x", "path": "b/b.yaml"}, status=200)
+            text, files = pack(load_campaign(tmp_path / "a" / "a.yaml"))
+            third = await served.post("/campaigns", {"id": "x", "text": text, "files": files}, status=200)
+            assert first["id"] == second["id"] == third["id"]
+            vessel = tmp_path / "b" / "narrow.yaml"
+            vessel.write_text(vessel.read_text(encoding="utf-8").replace("mm", "cm", 1), encoding="utf-8")
+            if load_campaign(tmp_path / "b" / "b.yaml"):
+                await served.post("/campaigns", {"id": "x", "path": "b/b.yaml"}, status=409)
+
+    run(work())
+
+
+def test_the_command_waits_for_the_check_and_makes_an_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    campaign, states, sent = campaign_in(tmp_path), ["checking", "checking", "refused"], list[dict[str, Any]]()
+
+    def item() -> dict[str, Any]:
+        return {"id": "cup-1", "state": states.pop(0), "rig": "virtual", "waits_for": "", "reason": "cups touch"}
+
+    client = SimpleNamespace(submit=lambda body: sent.append(body) or item(), get=lambda path: item())
+    monkeypatch.setattr(queue_commands, "connected_client", lambda *where: contextlib.nullcontext(client))
+    result = CliRunner().invoke(app, ["queue", "submit", str(campaign)])
+    assert result.exit_code == 2
+    assert "cups touch" in result.stderr
+    assert not states
+    assert SubmissionIn.model_validate(sent[0]).id.startswith("small-")
+
+
+def test_a_submission_without_a_response_is_sent_again_with_its_id(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    seen: list[bytes] = []
+
+    def respond(request: httpx.Request) -> httpx.Response:
+        seen.append(request.content)
+        if len(seen) == 1:
+            raise httpx.ReadTimeout("timed out")
+        return httpx.Response(201, json={"id": "a"})
+
+    with Client("http://127.0.0.1:9", tmp_path, token="x" * 20) as client:
+        client._http = httpx.Client(base_url=client.url, transport=httpx.MockTransport(respond))
+        assert client.submit({"id": "a", "text": "b"}) == {"id": "a"}
+    assert seen[0] == seen[1]
