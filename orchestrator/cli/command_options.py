@@ -192,7 +192,7 @@ def command(work: Callable[..., None], *, quiet: bool = False) -> Callable[..., 
     return run
 
 
-def add_group(app: typer.Typer, name: str, text: str, *shown: str, quiet: bool = False) -> Callable[..., None]:
+def add_group(app: typer.Typer, name: str, text: str, *shown: str, quiet: bool = False) -> functools.partial[None]:
     """Add a group of commands to the application, or find the one of this name; returns `add_command` for it.
 
     Args:

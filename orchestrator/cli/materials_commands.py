@@ -149,7 +149,7 @@ def _show_entries(vessel: str, limit: int, url: str | None, state: Path | None) 
     if not rows:
         print_message(f"{vessel}: has no entry; 'decant materials list' lists the vessels")
     for row in rows:
-        when = time.strftime("%Y-%m-%d %H:%M", time.localtime(row["t"]))
+        when = time.strftime("%Y-%m-%d %H:%M %Z", time.localtime(row["t"]))
         about = "  ".join(text for text in (row["pour"], row["by"], row["note"]) if text)
         print(f"{when}  {row['kind']:8s} {_content(row):24s} {about}".rstrip())
 

@@ -116,6 +116,13 @@ def submit(
     not_before: Annotated[
         str | None, typer.Option(metavar="TIME", help="Earliest start with its zone: 2026-11-27T08:00:00+01:00.")
     ] = None,
+    after: Annotated[
+        str | None,
+        typer.Option(metavar="CAMPAIGN_ID", help="Start when this campaign has ended as complete."),
+    ] = None,
+    after_any: Annotated[
+        str | None, typer.Option(metavar="CAMPAIGN_ID", help="Start when this campaign has ended with any verdict.")
+    ] = None,
     laboratory: OtherLaboratory = None,
     seed: Seed = None,
     parameters: Parameters = None,
@@ -135,6 +142,8 @@ def submit(
     from orchestrator.cli.foreground_run import read_campaign
     from orchestrator.daemon.rigs.submissions import names_laboratory, pack, pack_unresolved
 
+    if after and after_any:
+        raise RefusalError("--after and --after-any exclude each other: a campaign waits for one other")
     changes = (laboratory, seed, parameters, receiver, iterations)
     try:
         if changes == (None,) * 5 and not names_laboratory(campaign):
@@ -155,6 +164,8 @@ def submit(
         caller_id = f"id-{caller_id}"
     with connected_client(url, state) as client:
         body = {"text": packed, "files": files, "task": task, "rig": rig, "priority": priority, "id": caller_id}
+        if after or after_any:
+            body["after"] = {"campaign": after or after_any, "verdict": "complete" if after else "any"}
         queued = client.submit({**body, "not_before": not_before})
         if queued["state"] == "checking":
             queued = _checked(client, queued)
@@ -206,7 +217,7 @@ def list_campaigns(key: CampaignOrAll = None, url: Url = None, state: State = No
     for of, stop in stops:
         if stop:
             print_message(
-                f"EMERGENCY STOP{of} by {stop['by']}, {_clock(stop['time'])}: {stop['reason'] or 'no reason given'}"
+                f"EMERGENCY STOP{of} by {stop['by']}, {local_time(stop['time'])}: {stop['reason'] or 'no reason given'}"
             )
     for problem in status["problems"]:
         print_message(f"problem: {problem}")
@@ -217,7 +228,7 @@ def list_campaigns(key: CampaignOrAll = None, url: Url = None, state: State = No
         print_message("the queue is paused: decant queue resume")
     rows = [("CAMPAIGN", "STATE", "RIG", "SUBMITTED", "")]
     for item in campaigns:
-        rows.append((item["id"], item["state"], item["rig"], _clock(item["created"]), _standing(item)))
+        rows.append((item["id"], item["state"], item["rig"], local_time(item["created"]), _standing(item)))
     widths = [max(len(row[i]) for row in rows) for i in range(4)]
     for row in rows:
         print("  ".join([*(text.ljust(width) for text, width in zip(row[:4], widths, strict=True)), row[4]]).rstrip())
@@ -229,7 +240,12 @@ def _standing(item: dict[str, Any]) -> str:
     progress = item["progress"]
     if progress is None:
         reason = str(item["reason"]).split("\n", maxsplit=1)[0][:100]
-        return " · ".join(filter(None, (reason, item["waits_for"] and f"waits for: {item['waits_for']}")))
+        waits_for = item["waits_for"]
+        if item["not_before"] and waits_for.startswith(
+            "its earliest start"
+        ):  # in the zone of this machine, as the rest
+            waits_for = f"its earliest start, {local_time(item['not_before'])}"
+        return " · ".join(filter(None, (reason, waits_for and f"waits for: {waits_for}")))
     parts = [f"{progress['stage']} ({progress['stage_index']}/{progress['stage_count']})"] if progress["stage"] else []
     if progress["of_pours"]:
         parts.append(f"{progress['pours']}/{progress['of_pours']} pours")
@@ -246,10 +262,12 @@ def _show(key: str, url: str | None, state: Path | None, as_json: bool) -> None:
         print_json(item)
         return
     print(f"{item['id']}: {item['state']}  ({item['task']} on {item['rig']}, {item['mode']})")
-    for name in ("reason", "waits_for", "run", "live"):
+    for name in ("reason", "run", "live"):
         if item[name]:
-            print(f"  {name.replace('_', ' '):10s} {item[name]}")
-    print(f"  submitted  {_clock(item['created'])} by {item['by']}")
+            print(f"  {name:10s} {item[name]}")
+    if item["progress"] is None and item["waits_for"]:
+        print(f"  now        {_standing({**item, 'reason': ''})}")
+    print(f"  submitted  {local_time(item['created'])} by {item['by']}")
     if item["progress"] is not None:
         print(f"  now        {_standing(item)}")
         print(f"             {item['progress']['line']}")
@@ -259,7 +277,7 @@ def _show(key: str, url: str | None, state: Path | None, as_json: bool) -> None:
         predicted = f"  predicted {pour['predicted']}" if pour["predicted"] else ""
         print(f"  pour {pour['number']:<3d} into {pour['receiver']}  {pour['action']}{predicted}  → {told}")
     for entry in item["audit"]:
-        print(f"  {_clock(entry['t'])}  {entry['by']}: {entry['what']} {entry['detail']}".rstrip())
+        print(f"  {local_time(entry['t'])}  {entry['by']}: {entry['what']} {entry['detail']}".rstrip())
 
 
 def logs(
@@ -318,7 +336,7 @@ def _line(event: dict[str, Any]) -> str | None:
             text = f"{event['by']}: {event['what']} {event['detail']}".rstrip()
         case _:
             text = " ".join([kind, *(str(event[k]) for k in ("text", "rig", "state") if event.get(k))])
-    return f"{_clock(event['time'])}  {event['campaign'] or 'daemon'}  {text}"
+    return f"{local_time(event['time'])}  {event['campaign'] or 'daemon'}  {text}"
 
 
 def _finished(event: dict[str, Any]) -> str:
@@ -439,7 +457,7 @@ def answer(
 
 
 def _print_question(question: dict[str, Any]) -> None:
-    print(f"\nquestion {question['id']} ({question['campaign']}, {question['rig']}), {_clock(question['asked'])}")
+    print(f"\nquestion {question['id']} ({question['campaign']}, {question['rig']}), {local_time(question['asked'])}")
     if question["problem"]:
         print(f"  {question['problem']}")
     print(f"  {question['text']}")
@@ -472,10 +490,17 @@ def enable(key: CampaignId, url: Url = None, state: State = None) -> None:
 def shutdown(url: Url = None, state: State = None) -> None:
     """Shut the daemon down at the next safe point; a second time: at once. The queue is kept."""
     with connected_client(url, state) as client:
-        client.post("/shutdown")
-    print("ending at the next safe point; its queue is kept")
+        ending = client.post("/shutdown")
+    if ending["at_once"] or not ending["waits_for"]:
+        print("ending now; its queue is kept")
+        return
+    print("ending, and its queue is kept; it waits for:")
+    for line in ending["waits_for"]:
+        print(f"  {line}")
+    print_message("a second 'decant server stop' does not wait: a pour that has begun is then UNKNOWN")
 
 
-def _clock(t: float) -> str:
+def local_time(t: float) -> str:
+    """A time in the zone of this machine, with the zone; without the date if it is today's."""
     same_day = time.strftime("%Y%m%d", time.localtime(t)) == time.strftime("%Y%m%d")
-    return time.strftime("%H:%M:%S" if same_day else "%Y-%m-%d %H:%M", time.localtime(t))
+    return time.strftime("%H:%M:%S %Z" if same_day else "%Y-%m-%d %H:%M %Z", time.localtime(t))

@@ -87,7 +87,7 @@ def restore(
 
     with Refused(RunError), Refused(OSError):
         restored = state_backup.restore(file, state or state_directory())
-    then = time.strftime("%Y-%m-%d %H:%M", time.localtime(restored["time"]))
+    then = time.strftime("%Y-%m-%d %H:%M %Z", time.localtime(restored["time"]))
     print(f"restored the state of {then}: {restored['campaigns']:.0f} campaigns, {restored['runs']:.0f} runs")
     print_message(
         "the queue is paused. Pours made since then are not in it: weigh the vessels, then decant queue resume"

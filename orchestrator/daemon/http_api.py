@@ -93,7 +93,14 @@ def serve_app(daemon: Supervisor, tokens: Tokens, shutdown: Callable[[], None]) 
     app.state.tokens, app.state.shutdown = tokens, shutdown
     daemon.shared.token_problems = lambda: tokens.problems
     app.state.ordering = Ordering(daemon.shared, daemon.queue)
-    app.add_middleware(RequestGuard, limit=settings.body_limit, host=settings.host, tokens=tokens)
+    app.add_middleware(
+        RequestGuard,
+        limit=settings.body_limit,
+        host=settings.host,
+        tokens=tokens,
+        names=settings.names,
+        counted=daemon.shared.counted,
+    )
     return app
 
 

@@ -20,6 +20,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from typing import Any, NoReturn
 
 import uvicorn
@@ -285,7 +286,8 @@ async def _serve_with(
         until = [asyncio.ensure_future(event.wait()) for event in (ending.asked, daemon.left)]
         await asyncio.wait({serving, *until}, return_when=asyncio.FIRST_COMPLETED)
         if not daemon.left.is_set():
-            _log.info("ending: what has begun comes to rest at the next safe point; once more to give it up")
+            work = "; ".join(daemon.queue.running_work()) or "nothing, no campaign runs"
+            _log.info("ending; waits for: %s. A second request or signal does not wait", work)
         await daemon.close()
         if notifying is not None:
             await notifying
@@ -357,10 +359,16 @@ def _url(settings: DaemonSettings, listening: socket.socket) -> str:
     return f"{'http' if settings.certificate is None else 'https'}://{host}:{port}"
 
 
+class _UtcFormatter(JsonFormatter):
+    def formatTime(self, record: logging.LogRecord, datefmt: str | None = None) -> str:  # noqa: N802  logging's name
+        """The time with its zone, which is UTC in logs."""
+        return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+
+
 def log_lines(stream: Any = None) -> None:
     """Configure structured logs: one JSON object per line on stdout, as service managers collect them."""
     handler = logging.StreamHandler(stream or sys.stdout)
-    form = JsonFormatter(
+    form = _UtcFormatter(
         "{asctime}{levelname}{name}{message}",
         style="{",
         rename_fields={"asctime": "time", "levelname": "level", "name": "from"},

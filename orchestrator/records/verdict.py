@@ -15,7 +15,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 from orchestrator.learning.dispense import dose_outcome
-from orchestrator.learning.requests import Failed
+from orchestrator.learning.requests import Failed, Pour
+from orchestrator.learning.requests import Outcome as RequestOutcome
 from orchestrator.learning.stage_result import ResultPart, entered_by_hand, weighed_masses
 from orchestrator.records.codec import from_json
 from orchestrator.records.run_record import RunPour, RunState
@@ -146,13 +147,12 @@ def verdict_of(record: RunState) -> Verdict:
     return Verdict(word=word, text=text, pours=pours, doses=doses, cups=cups, unmet=tuple(unmet))
 
 
-def _outcome(pour: RunPour) -> Outcome:
-    if pour.state == "asked":
-        return "untried"
-    if pour.request.dose is not None:
-        outcome = dose_outcome(pour.request.dose, pour.outcome)
-        return "made" if outcome == "reached" else outcome
-    match pour.outcome:
+def outcome_of(request: Pour, outcome: RequestOutcome | None) -> Outcome:
+    """Outcome of a pour or a dose that has begun; None: it has none yet, and is UNKNOWN if it never gets one."""
+    if request.dose is not None:
+        reached = dose_outcome(request.dose, outcome)
+        return "made" if reached == "reached" else reached
+    match outcome:
         case None | Failed(kind="pour_unknown"):
             return "unknown"
         case Failed(kind="invalid_action"):
@@ -160,6 +160,10 @@ def _outcome(pour: RunPour) -> Outcome:
         case Failed():
             return "failed"
     return "made"
+
+
+def _outcome(pour: RunPour) -> Outcome:
+    return "untried" if pour.state == "asked" else outcome_of(pour.request, pour.outcome)
 
 
 def _counted(outcomes: Sequence[Outcome], pours: Sequence[RunPour], untried: int = 0) -> OutcomeCounts:

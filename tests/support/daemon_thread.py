@@ -7,6 +7,7 @@ import contextlib
 import socket
 import threading
 from pathlib import Path
+from typing import Any
 
 import uvicorn
 
@@ -21,8 +22,8 @@ from tests.support.waiting import PATIENCE
 class Real:
     """A daemon in a thread, with a socket that anybody on this machine can reach."""
 
-    def __init__(self, state: Path) -> None:
-        self.settings = DaemonSettings(state, in_process=True, keep_free=0, quick_start=False)
+    def __init__(self, state: Path, **settings: Any) -> None:
+        self.settings = DaemonSettings(state, in_process=True, keep_free=0, quick_start=False, **settings)
         state.mkdir(exist_ok=True)
         self.tokens = Tokens(self.settings.tokens)
         self.socket = socket.socket()

@@ -12,7 +12,8 @@ import asyncio
 import contextlib
 import json
 import re
-from collections.abc import Awaitable, Callable, MutableMapping
+from collections import Counter
+from collections.abc import Awaitable, Callable, MutableMapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -63,20 +64,37 @@ class RequestGuard:
         limit: largest body [bytes].
         host: address that the API listens at; host names are checked on the loopback interface only.
         tokens: valid tokens.
+        names: further host names, under which a proxy passes requests on.
+        counted: takes the number of responses by status.
     """
 
     def __init__(
-        self, app: Callable[[Message, Receive, Send], Awaitable[None]], limit: int, host: str, tokens: Tokens
+        self,
+        app: Callable[[Message, Receive, Send], Awaitable[None]],
+        limit: int,
+        host: str,
+        tokens: Tokens,
+        names: Sequence[str],
+        counted: Counter[tuple[str, str, str]],
     ) -> None:
-        self._app, self._limit, self._tokens = app, limit, tokens
-        self._names = frozenset((*LOOPBACK, "[::1]", host)) if host in LOOPBACK else None
+        self._app, self._limit, self._tokens, self._counted = app, limit, tokens, counted
+        own = (*LOOPBACK, "[::1]", host, *(name.lower() for name in names))
+        self._names = frozenset(own) if host in LOOPBACK else None
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
         """Handle one ASGI connection."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        scope = route_scope(scope)
+
+        async def counting(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                self._counted["http", str(message["status"]), ""] += 1
+            await send(message)
+
+        await self._guarded(route_scope(scope), receive, counting)
+
+    async def _guarded(self, scope: Message, receive: Receive, send: Send) -> None:
         stop = is_stop(scope)
         headers = {name.lower(): value for name, value in scope["headers"]}
         expects = b"100-continue" in headers.get(b"expect", b"").lower()
@@ -84,7 +102,10 @@ class RequestGuard:
         name = host if host.startswith("[") and host.endswith("]") else host.rpartition(":")[0] or host
         foreign = self._names is not None and name not in self._names
         if foreign and not (stop and stopping_person(scope, self._tokens)):
-            text = "this daemon is reached as 127.0.0.1 or localhost, and not by another name"
+            text = (
+                "this daemon is reached as 127.0.0.1 or localhost, and not by another name. Behind a proxy, add the "
+                "name to its settings: 'listen: {names: [lab.example.org]}'"
+            )
             await _refuse(receive, send, 421, not_stopped(text) if stop else text, drain=not expects)
             return
         if stop:

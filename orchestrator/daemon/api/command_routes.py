@@ -24,6 +24,7 @@ from orchestrator.daemon.api.schemas import (
     CampaignOut,
     ClearIn,
     EnableIn,
+    EndingOut,
     MoveIn,
     StatusOut,
     StoppedOut,
@@ -257,9 +258,10 @@ async def clear(daemon: Daemon, stops: Stops, person: Admin, body: ClearIn | Non
 
 
 @router.post("/shutdown", status_code=202, operation_id="shutdown")
-async def shutdown(request: Request, daemon: Daemon, stops: Stops, person: Admin) -> StatusOut:
-    """Shut the daemon down at the next safe point; a second request does so at once."""
+async def shutdown(request: Request, daemon: Daemon, queue: Queue, stops: Stops, person: Admin) -> EndingOut:
+    """Shut the daemon down at the next safe point; a second request gives up what it still waits for."""
     daemon.note(person.name, "shutdown")
-    state = await status(daemon, stops, person)
+    state = (await status(daemon, stops, person)).model_dump()
+    at_once, waits_for = daemon.stopping, queue.running_work()
     request.app.state.shutdown()
-    return state
+    return EndingOut.model_validate({**state, "stopping": True, "waits_for": waits_for, "at_once": at_once})

@@ -13,12 +13,12 @@ import time
 from collections.abc import AsyncIterator, Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from fastapi import APIRouter, Header, HTTPException, Query, Response
 from fastapi.responses import FileResponse, StreamingResponse
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
-from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from pydantic import Field
 
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
@@ -33,6 +33,7 @@ from orchestrator.daemon.state.run_readout import REPORT, summary_of
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal_file import free_space
+from orchestrator.records.verdict import VerdictWord
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 
 READERS = 400
@@ -222,12 +223,31 @@ def campaign_out(daemon: SharedServices, queue: CampaignQueue, item: QueueItem) 
         {
             **table,
             "needs_enabling": item.mode == "hardware" and not item.motion_enabled and waits,
+            "followers": daemon.store.followers(item.id),
             "waits_for": queue.waits_for(item),
             "progress": progress,
             "report": run is not None and (run / REPORT).is_file(),
             "live": None if progress is None else daemon.live_url,
         }
     )
+
+
+COUNTED = {
+    "pours": "Pours of an action since the daemon's start, by outcome.",
+    "doses": "Doses of an amount since the daemon's start; missed: beyond the tolerance.",
+    "faults": "Faults of unattended pours since the daemon's start.",
+    "campaigns_ended": "Runs that came to an end or to rest since the daemon's start, by verdict or state.",
+}
+"""Subjects that are counted, with their descriptions."""
+
+_POURED = ("made", "refused", "failed", "unknown")
+OUTCOMES = {
+    "pours": _POURED,
+    "doses": ("missed", *_POURED),
+    "faults": ("fault",),
+    "campaigns_ended": (*get_args(VerdictWord), "failed", "paused", "unknown"),
+}
+"""Outcomes by subject. All of them have a value from the start on, so that the first increase is seen."""
 
 
 class _Collector:
@@ -247,6 +267,18 @@ class _Collector:
         for name, worker in daemon.workers.items():
             busy.add_metric([name], float(worker.running is not None))
         yield busy
+        for subject, text in COUNTED.items():
+            counted = CounterMetricFamily(f"decant_{subject}", text, labels=["rig", "outcome"])
+            rigs = daemon.workers if subject == "campaigns_ended" else [rig.name for rig in daemon.settings.rigs]
+            for rig in rigs:
+                for outcome in OUTCOMES[subject]:
+                    counted.add_metric([rig, outcome], daemon.counted[subject, rig, outcome])
+            yield counted
+        errors = CounterMetricFamily("decant_http_responses", "Responses of the API, by status.", labels=["status"])
+        for (subject, status, _), count in sorted(daemon.counted.items()):
+            if subject == "http":
+                errors.add_metric([status], count)
+        yield errors
         words = GaugeMetricFamily(
             "decant_notifications", "Notifications sent to receivers.", labels=["receiver", "outcome"]
         )

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from orchestrator.daemon.rigs.pour_request import Moment, RequestModel
+from orchestrator.daemon.rigs.pour_request import AfterIn, Moment, RequestModel
 from orchestrator.learning.dispense import MixedComponent
 from orchestrator.reports.run_summary import PourSummary
 
@@ -36,6 +36,9 @@ class MoveIn(RequestModel):
     priority: int | None = Field(default=None, ge=-1000, le=1000)
     not_before: Moment | None = None
     """Earliest start; 0 removes it."""
+
+    after: AfterIn | Literal[""] | None = None
+    """Campaign that has to end first; '' removes the condition."""
 
 
 class EnableIn(RequestModel):
@@ -88,6 +91,16 @@ class ProgressOut(ResponseModel):
     seconds_left: float | None
 
 
+class AfterOut(ResponseModel):
+    """A campaign that has to end first."""
+
+    campaign: str
+    """Its id."""
+
+    verdict: Literal["complete", "any"]
+    """Verdict that it needs."""
+
+
 # More than 20 fields: a flat JSON object that programs read.
 class CampaignOut(ResponseModel):
     """A submitted campaign."""
@@ -121,6 +134,15 @@ class CampaignOut(ResponseModel):
 
     not_before: float | None
     """Earliest start."""
+
+    verdict: Literal["complete", "incomplete", "nothing"] | None
+    """What its run reached, once it has ended."""
+
+    after: AfterOut | None
+    """Campaign that has to end before it starts."""
+
+    followers: list[str]
+    """Ids of the campaigns that wait for its end."""
 
     waits_for: str
     """What has to happen before it starts or continues; '' if only its turn."""
@@ -263,3 +285,13 @@ class StoppedOut(StatusOut):
 
     notes: list[str]
     """What was shortened, replaced or ignored in the request; the stop was given in any case."""
+
+
+class EndingOut(StatusOut):
+    """State of the daemon after a request to shut it down."""
+
+    waits_for: list[str]
+    """What has to come to rest first, by campaign; empty if nothing runs."""
+
+    at_once: bool
+    """Whether it was shutting down already, and now gives up what it waits for."""

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
+from typing import Literal
 
 from orchestrator.daemon.rigs.emergency_stop import EmergencyStops
 from orchestrator.daemon.rigs.rig_worker import SharedServices
@@ -30,6 +31,7 @@ from orchestrator.daemon.state.daemon_store import (
     QueueItem,
 )
 from orchestrator.learning.run_errors import RunError
+from orchestrator.reports.progress_state import CHECKPOINT_WORDS
 from orchestrator.runs.stages import POUR
 
 _log = logging.getLogger(__name__)
@@ -173,8 +175,17 @@ class CampaignQueue:
         before: str | None = None,
         priority: int | None = None,
         not_before: float | None = None,
+        after: dict[str, str] | Literal[""] | None = None,
     ) -> QueueItem:
-        """Move a queued campaign in front of another one or to the head (''), or change its priority or earliest start.
+        """Move a queued campaign in front of another one or to the head (''), or change when it may start.
+
+        Args:
+            key: id of the campaign.
+            by: who moves it.
+            before: id of the other campaign.
+            priority: another priority.
+            not_before: another earliest start; 0 for none.
+            after: another campaign that has to end first; '' for none.
 
         Raises:
             KeyError: the campaign does not exist.
@@ -185,6 +196,8 @@ class CampaignQueue:
             self._store.change(item.id, priority=priority)
         if not_before is not None:
             self._store.change(item.id, not_before=not_before or None)
+        if after is not None:
+            self._store.change(item.id, after=self.resolved_after(after, item.id) if after else None)
         if before is not None:
             queue = [e for e in self._store.items(["queued"]) if e.id != item.id]
             at = 0 if before == "" else next((i for i, e in enumerate(queue) if e.id == self.item(before).id), None)
@@ -197,6 +210,27 @@ class CampaignQueue:
         self._shared.note(by, "move", item.id)
         self._shared.wake()
         return self.item(item.id)
+
+    def resolved_after(self, after: dict[str, str], key: str = "") -> dict[str, str]:
+        """Return a condition with the whole id of its campaign.
+
+        Args:
+            after: the condition.
+            key: id of the campaign that waits; '' for a new one.
+
+        Raises:
+            RequestRefusedError: there is no such campaign, or it waits for this one.
+        """
+        try:
+            first = self.item(after["campaign"])
+        except KeyError:
+            raise RequestRefusedError(f"after: there is no campaign '{after['campaign']}'") from None
+        chain: QueueItem | None = first
+        while chain is not None:
+            if chain.id == key:
+                raise RequestRefusedError(f"after: {first.id} waits for {key} itself")
+            chain = None if chain.after is None else self._store.item(chain.after["campaign"])
+        return {**after, "campaign": first.id}
 
     def pause_all(self, paused: bool, by: str) -> None:
         """Start no further campaigns, or start them again. Running campaigns continue."""
@@ -266,10 +300,30 @@ class CampaignQueue:
             return f"an operator has to enable its motion: 'decant queue enable {item.id}'"
         if item.state == "queued" and shared.queue_paused:
             return "the queue is paused: the command 'resume', or 'decant queue resume'"
+        if item.state == "queued" and (reason := shared.waits_for_another(item)):
+            return reason
         if item.state == "queued" and item.not_before is not None and item.not_before > time.time():
             begins = datetime.fromtimestamp(item.not_before).astimezone()
             return f"its earliest start, {begins.isoformat(' ', 'seconds')}"
         return ""
+
+    def running_work(self) -> list[str]:
+        """What has to come to rest before the daemon can end, by campaign."""
+        lines = []
+        for rig, worker in self._shared.workers.items():
+            if (running := worker.running) is None:
+                continue
+            key = running.item.id
+            question = next(iter(self._store.questions(campaign=key)), None)
+            if question is not None:
+                rest = f"the answer to question {question.id} ('decant queue answer {question.id} …'): {question.text}"
+            else:
+                step = CHECKPOINT_WORDS.get(running.checkpoint, running.checkpoint)
+                rest = (
+                    f"the pour under way, which is weighed (now {step})" if running.pouring else "its next safe point"
+                )
+            lines.append(f"{key} at rig {rig}: {rest}")
+        return lines
 
     def resume(self, key: str, by: str) -> QueueItem:
         """Resume a campaign that is at rest.

@@ -91,7 +91,8 @@ class Ordering:
     async def _place_campaign(self, request: SubmissionIn, key: str, by: str) -> tuple[QueueItem, bool]:
         if self._daemon.store.by_caller_id(request.id) is None:
             self._queue.refuse_new_work()
-        submission = Submission(**request.model_dump(exclude={"id"}))
+        after = None if request.after is None else self._queue.resolved_after(request.after.model_dump())
+        submission = Submission(**request.model_dump(exclude={"id", "after"}), after=after)
         item = await asyncio.to_thread(receive, self._daemon.settings, submission, key, by)
         earlier = self._daemon.store.by_caller_id(request.id)
         if earlier is not None:

@@ -176,6 +176,16 @@ class PourIn(RequestModel):
     """Predict the pour before it is queued. An action is predicted by simulations, which takes seconds."""
 
 
+class AfterIn(RequestModel):
+    """A campaign that has to end first."""
+
+    campaign: Key
+    """Its id, its caller's id, or a prefix of it."""
+
+    verdict: Literal["complete", "any"] = "complete"
+    """'complete': it has to end with this verdict; 'any': whatever it reached."""
+
+
 class SubmissionIn(RequestModel):
     """A campaign: `text` with its `files`, or the `path` of a file on the daemon's machine."""
 
@@ -201,6 +211,9 @@ class SubmissionIn(RequestModel):
 
     not_before: Moment | None = None
     """Earliest start."""
+
+    after: AfterIn | None = None
+    """Campaign that has to end before this one starts."""
 
 
 def problems_text(errors: Iterable[Mapping[str, Any]], begin: int = 0) -> str:

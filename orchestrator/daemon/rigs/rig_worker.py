@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import logging
 import time
+from collections import Counter
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,15 +29,17 @@ from orchestrator.daemon.state.event_feed import Feed
 from orchestrator.daemon.state.notifications import Counts
 from orchestrator.daemon.state.run_readout import Pours, found_at, prune_recordings
 from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.requests import Pour
 from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.live_server import LiveView
 from orchestrator.live_view.rerun_subscriber import RerunMonitor, recorder_of
-from orchestrator.records.events import CampaignStateChanged, Event
+from orchestrator.records.events import CampaignStateChanged, Event, LogLine, RequestFinished
 from orchestrator.records.journal_file import MB, JournalError, free_space
 from orchestrator.records.run_clock import run_time
-from orchestrator.records.run_record import CampaignResult
+from orchestrator.records.run_record import CampaignResult, read_record
 from orchestrator.records.run_registry import make_state_directory
 from orchestrator.records.states import State
+from orchestrator.records.verdict import outcome_of, verdict_of
 from orchestrator.reports.progress_state import CHECKPOINT_WORDS, ProgressState
 from orchestrator.reports.publishing import publish_run, publish_so_far
 from orchestrator.reports.validity_warnings import not_simulated
@@ -60,6 +63,7 @@ class SharedServices:
         problems: problems for the operator, by subject.
         token_problems: returns those of the token file.
         stopping: whether nothing starts any more.
+        counted: since the start: (subject, rig, outcome) → number, and ('http', status, '').
         rested: set when a campaign comes to rest; the charts of the laboratories are then read.
         suspect: whether the simulators may have failed for good: they are restarted when no campaign uses them.
     """
@@ -80,6 +84,7 @@ class SharedServices:
         self.token_problems: Callable[[], list[str]] = list
         self.notification_counts: dict[str, Counts] = {}
         self.pours = Pours()
+        self.counted: Counter[tuple[str, str, str]] = Counter()
         self.stopping = self.suspect = False
         self.rested = asyncio.Event()
         self.began = time.time()
@@ -108,6 +113,33 @@ class SharedServices:
     def running_laboratories(self) -> list[str]:
         """Names of the laboratories in which campaigns run."""
         return [worker.running.laboratory for worker in self.workers.values() if worker.running is not None]
+
+    def waits_for_another(self, item: QueueItem) -> str:
+        """The campaign that has to end before one may start, with its state; '' if none has."""
+        if item.after is None:
+            return ""
+        first = self.store.item(item.after["campaign"])
+        if first is None:
+            return ""
+        if first.state not in ENDED:
+            return f"the end of {first.id}, which is {first.state}"
+        if item.after["verdict"] == "any" or first.verdict == item.after["verdict"]:
+            return ""
+        reached = first.state if first.verdict is None else f"{first.state}, {first.verdict}"
+        wanted = item.after["verdict"]
+        return f"an operator: {first.id} is {reached}, and has to be {wanted}; remove the condition, or take it out"
+
+    def count_finished(self, rig: str) -> Callable[[Event], None]:
+        """Return a subscriber that counts a rig's pours and doses by outcome, and faults of unattended pours."""
+
+        def receive(event: Event) -> None:
+            if isinstance(event, LogLine) and event.about == "fault":
+                self.counted["faults", rig, "fault"] += 1
+            if isinstance(event, RequestFinished) and isinstance(event.request, Pour) and not event.replayed:
+                kind = "pours" if event.request.dose is None else "doses"
+                self.counted[kind, rig, outcome_of(event.request, event.outcome)] += 1
+
+        return receive
 
     def wake(self) -> None:
         """Wake all rig workers after a change."""
@@ -246,7 +278,12 @@ class Running:
             operator=RemoteOperator(asking, key, rig, self._announce) if asks else None,
             ask_operator=RunQuestions(asking, self._shared.store, key, rig, load, lambda: found_at(plan.laboratory)),
             approved_checksum=checksum,
-            subscribers=[self._shared.feed.subscriber(key), self._progress, self._note_state],
+            subscribers=[
+                self._shared.feed.subscriber(key),
+                self._progress,
+                self._note_state,
+                self._shared.count_finished(rig),
+            ],
             recorder=recorder,
         )
 
@@ -483,6 +520,7 @@ class RigWorker:
         begun = sorted((c for c in mine if c.run is not None), key=lambda c: c.begun or 0.0)
         now = time.time()
         queued = [c for c in mine if c.state == "queued" and (c.not_before is None or c.not_before <= now)]
+        queued = [c for c in queued if not self._shared.waits_for_another(c)]
         if self._shared.queue_paused:
             queued = []
         following = next((c for c in (*begun, *queued) if c.mode != "hardware" or c.motion_enabled), None)
@@ -558,6 +596,16 @@ class RigWorker:
         reason = stored.reason if stored is not None else ""
         return state, reason, desired
 
+    def _verdict(self, run: str | None) -> str | None:
+        """The verdict of a run, or None if it has none or its journal can't be read."""
+        if run is None:
+            return None
+        try:
+            return verdict_of(read_record(self._shared.settings.runs / run)).word
+        except (RunError, OSError, ValueError) as error:
+            _log.error("%s: no verdict: %s", run, error)
+            return None
+
     async def _leave(self, running: Running, state: str, reason: str, desired: DesiredState) -> None:
         store, key = self._shared.store, running.item.id
         if running.item.task == POUR:
@@ -570,10 +618,15 @@ class RigWorker:
                 reason = f"its results could not be published: {error}"
                 _log.exception("campaign %s: not published", key)
         ended = time.time() if state in ENDED else None
-        store.change(key, state=state, reason=reason, desired_state=str(desired), ended=ended)
+        verdict = await asyncio.to_thread(self._verdict, running.item.run) if ended is not None else None
+        if state == "unknown":
+            self._shared.counted["pours", self.rig.name, "unknown"] += 1
+        self._shared.counted["campaigns_ended", self.rig.name, verdict or state] += 1
+        store.change(key, state=state, reason=reason, desired_state=str(desired), ended=ended, verdict=verdict)
         self.running = None  # whoever hears that it rests may have it go on
         self._shared.feed.publish("CampaignRests", {"state": state, "reason": reason, "rig": self.rig.name}, key)
         self._shared.rested.set()
+        self._shared.wake()  # campaigns of other rigs may wait for this one
         with contextlib.suppress(OSError):
             busy = {worker.running.item.run for worker in self._shared.workers.values() if worker.running is not None}
             await asyncio.to_thread(prune_recordings, self._shared.settings, {name for name in busy if name})

@@ -364,6 +364,7 @@ def _received(settings: DaemonSettings, submission: Submission, key: str, by: st
         by,
         0.0,
         not_before=submission.not_before,
+        after=submission.after,
     )
     rig: Rig | None = None
     plan: CampaignPlan | None = None

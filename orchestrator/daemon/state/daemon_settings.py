@@ -60,6 +60,10 @@ class ListenSettings(Settings):
     port: Port = PORT
     """TCP port; 0 selects a free one, which is written to the state directory."""
 
+    names: list[Text] | None = None
+    """Host names under which a proxy on this machine passes requests on to a loopback address, such as
+    lab.example.org; others than the machine's own are refused without them."""
+
     tls: TlsSettings | None = None
     """TLS certificate; required for addresses other than loopback."""
 
@@ -178,6 +182,7 @@ class DaemonSettings:
     state: Path
     host: str = "127.0.0.1"
     port: int = PORT
+    names: tuple[str, ...] = ()
     certificate: Path | None = None
     key: Path | None = None
     body_limit: int = 4_000_000  # a campaign with all files that it refers to
@@ -333,6 +338,7 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> DaemonSettings:
         state=state or state_directory(),
         host=file.listen.host,
         port=file.listen.port,
+        names=tuple(file.listen.names or ()),
         certificate=files[0],
         key=files[1],
         rigs=tuple(rigs) or (Rig(ANY_RIG),),

@@ -25,7 +25,10 @@ from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal_file import locked_alone
 from orchestrator.records.run_registry import make_state_directory
 
-FORMAT = 5
+FORMAT = 6
+
+_UPGRADES = {5: "alter table campaign add column verdict text; alter table campaign add column after text;"}
+"""Format → statements that convert it to the next one."""
 
 _SCHEMA = """
 create table campaign (
@@ -34,7 +37,8 @@ create table campaign (
     reason text not null,
     by text not null, created real not null, begun real, ended real, run text, motion_enabled integer not null,
     answers text not null check (json_valid(answers)),
-    caller_id text not null default '', body_hash text not null default '', not_before real
+    caller_id text not null default '', body_hash text not null default '', not_before real,
+    verdict text, after text check (after is null or json_valid(after))
 ) strict;
 create unique index campaign_by_caller_id on campaign (caller_id) where caller_id != '';
 create index campaign_by_state on campaign (state, rig);
@@ -141,6 +145,8 @@ class QueueItem:
         caller_id: id that its caller chose; '' without one.
         body_hash: digest of its caller's request, by which a repeated one is recognised.
         not_before: earliest start, seconds since 1970; None: at once.
+        verdict: of its run, once that has ended.
+        after: id of the campaign that has to end before it, and the verdict that this needs: `campaign`, `verdict`.
     """
 
     id: str
@@ -163,6 +169,8 @@ class QueueItem:
     caller_id: str = ""
     body_hash: str = ""
     not_before: float | None = None
+    verdict: str | None = None
+    after: dict[str, str] | None = None
 
 
 class QuestionOut(BaseModel):
@@ -203,7 +211,7 @@ class QuestionOut(BaseModel):
         return self.closed is None
 
 
-_JSON = {"answers", "options", "details"}
+_JSON = {"answers", "options", "details", "after"}
 _BOOLEAN = {"motion_enabled", "hands"}
 
 
@@ -251,16 +259,20 @@ class Store:
 
     def _prepare(self) -> None:
         version = self._db.execute("pragma user_version").fetchone()[0]
-        if version not in (0, FORMAT):
+        if version not in (0, FORMAT, *_UPGRADES):
             raise StoreFormatError(
-                f"{self.path}: written in format {version}, this version of Decant reads format {FORMAT}; "
-                "use the version that wrote it, or name another folder with --state"
+                f"{self.path}: written in format {version}, this version of Decant reads formats {min(_UPGRADES)} to "
+                f"{FORMAT}; use the version that wrote it, or name another folder with --state"
             )
         self._db.row_factory = sqlite3.Row
         self._db.execute("pragma journal_mode = wal")
         self._db.execute("pragma synchronous = full")
         if version == 0:
             self._db.executescript(f"begin immediate; {_SCHEMA} {_STATION} pragma user_version = {FORMAT}; commit;")
+        while (version := self._db.execute("pragma user_version").fetchone()[0]) != FORMAT:
+            self._db.executescript(
+                f"begin immediate; {_UPGRADES[version]} pragma user_version = {version + 1}; commit;"
+            )
 
     def close(self) -> None:
         """Close the file and release the lock. May be called twice."""
@@ -322,6 +334,16 @@ class Store:
         """Return the campaign with an id of its caller, or None."""
         row = self._db.execute("select * from campaign where caller_id = ? and caller_id != ''", [caller_id]).fetchone()
         return None if row is None else _item(row)
+
+    def followers(self, key: str) -> list[str]:
+        """Return the ids of the campaigns that wait for the end of one, in the order of the queue."""
+        states = _quoted((*ENDED, "failed"))
+        rows = self.rows(
+            f"select id from campaign where json_extract(after, '$.campaign') = ? and run is null and "
+            f"state not in ({states}) order by priority desc, rank",
+            key,
+        )
+        return [row["id"] for row in rows]
 
     def counts(self) -> dict[str, int]:
         """Return the number of campaigns in each state."""
@@ -431,7 +453,7 @@ class Store:
 
 
 def _written(name: str, value: Any) -> Any:
-    if name in _JSON:
+    if name in _JSON and value is not None:
         return json.dumps(value, ensure_ascii=False)
     return int(value) if name in _BOOLEAN else value
 
@@ -439,7 +461,7 @@ def _written(name: str, value: Any) -> Any:
 def _read(row: sqlite3.Row) -> dict[str, Any]:
     values: Mapping[str, Any] = dict(row)
     return {
-        name: json.loads(value) if name in _JSON else bool(value) if name in _BOOLEAN else value
+        name: json.loads(value) if name in _JSON and value is not None else bool(value) if name in _BOOLEAN else value
         for name, value in values.items()
     }
 

@@ -150,7 +150,7 @@ def restore(source: Path, state: Path) -> dict[str, float]:
             *(str(DesiredState.PAUSE), *resting),
         )
         store.note(
-            "restore", "restore backup", detail=time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(about["time"]))
+            "restore", "restore backup", detail=time.strftime("%Y-%m-%d %H:%M:%S %Z", time.localtime(about["time"]))
         )
     finally:
         store.close()

@@ -32,7 +32,7 @@ from tests.orchestrator.reports.test_mixture_report import MIXTURES
 from tests.support.browser import OnPort, browser, on_port
 from tests.support.hardware_laboratory import hardware_rig
 from tests.support.toy_campaign import ToyOptimizer, ToySimulators
-from tests.support.toy_daemon import HeldBench, HeldLaboratory
+from tests.support.toy_daemon import CAMPAIGN, HeldBench, HeldLaboratory
 from tests.support.waiting import PATIENCE
 
 pytest.importorskip("playwright")
@@ -323,7 +323,7 @@ def test_with_two_rigs_each_is_stopped_and_cleared_alone_and_all_together(page: 
     laboratory = tmp_path / "numbers.yaml"
     laboratory.write_text("{name: numbers, bench: {liquid: {particles: 400}, time_scale: 0}}\n")
     rigs = tuple(Rig(name, laboratory, load_laboratory(laboratory)) for name in ("left", "right"))
-    with on_port(tmp_path, rigs=rigs) as lab:
+    with on_port(tmp_path, campaign=CAMPAIGN, rigs=rigs) as lab:
         keys = [lab.do(lab.served.submit(rig=rig.name)) for rig in rigs]
         for key in keys:
             lab.do(lab.served.until(key, "running"))
@@ -374,11 +374,40 @@ def test_an_arm_that_did_not_confirm_its_stop_is_not_missed(page: Any, tmp_path:
 def test_a_viewer_may_stop_everything_but_answers_nothing(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path, asking(**REFILL)) as lab:
         asked(lab)
+        lab.do(lab.served.submit())
         page.goto(lab.address(Role.VIEWER))
-        page.get_by_role("button", name="Done").click()
-        page.get_by_text("viewer is a viewer; this takes operator").wait_for()
+        page.get_by_text("An operator answers.").wait_for()
+        page.get_by_text("viewer (viewer)").wait_for()
+        for name in ("Done", "Give it up", "Hold the queue", "Take out", "Pause", "Finish and end", "Stop the motion"):
+            assert page.get_by_role("button", name=name).count() == 0, name
         page.get_by_role("button", name="EMERGENCY STOP").click()
-        page.get_by_role("heading", name="Emergency stop").wait_for()
+        page.get_by_text("An administrator clears it.").wait_for()
+        page.goto(lab.address(Role.OPERATOR))
+        page.get_by_role("button", name="Hold the queue").wait_for()
+        assert page.get_by_role("button", name="Clear the stop").count() == 0
+
+
+@pytest.mark.slow
+def test_the_header_of_four_rigs_is_one_line_on_a_phone_and_each_rig_has_its_stop(page: Any, tmp_path: Path) -> None:
+    laboratory = tmp_path / "numbers.yaml"
+    laboratory.write_text("{name: numbers, bench: {liquid: {particles: 400}, time_scale: 0}}\n")
+    names = ("north", "south", "east", "west")
+    rigs = tuple(Rig(name, laboratory, load_laboratory(laboratory)) for name in names)
+    page.set_viewport_size({"width": 390, "height": 844})
+    with on_port(tmp_path, rigs=rigs) as lab:
+        page.goto(lab.address(Role.VIEWER))
+        page.get_by_role("button", name="STOP north").wait_for()
+        assert page.locator("#head").bounding_box()["height"] <= 90
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        assert page.evaluate(LEGIBLE) == []
+        page.evaluate("scrollTo(0, document.body.scrollHeight)")
+        box = page.get_by_role("button", name="EMERGENCY STOP ALL").bounding_box()
+        assert 0 <= box["y"] <= 90
+        for name in names:
+            assert page.get_by_role("button", name=f"STOP {name}").count() == 1
+        page.get_by_role("button", name="STOP east").click()
+        page.get_by_role("heading", name="Emergency stop of east").wait_for()
+        page.get_by_role("article", name="rig east").get_by_text("STOPPED").wait_for()
 
 
 @pytest.mark.slow

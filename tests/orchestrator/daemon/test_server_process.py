@@ -6,8 +6,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import io
+import json
+import logging
 import threading
 import time
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +20,7 @@ import pytest
 from actors.laboratory import WarmSimulators
 from orchestrator.daemon import server_process
 from orchestrator.daemon.rigs import supervisor
-from orchestrator.daemon.server_process import MOST, RENEWED, DaemonRestart, RayWatch
+from orchestrator.daemon.server_process import MOST, RENEWED, DaemonRestart, RayWatch, log_lines
 from tests.support.toy_daemon import held, run, serving
 from tests.support.waiting import wait_async, wait_for
 
@@ -121,3 +125,15 @@ def test_people_are_told_where_ray_dies_again_and_again(monkeypatch: pytest.Monk
     assert "start it again" in daemon.problems[0]
     monkeypatch.setenv(RENEWED, " ".join(str(time.time() - server_process.WITHIN) for _ in range(MOST)))
     assert len(watched(monkeypatch, Daemon())) == 1
+
+
+def test_the_log_has_its_zone() -> None:
+    stream = io.StringIO()
+    root = logging.getLogger()
+    handlers, level = root.handlers, root.level
+    try:
+        log_lines(stream)
+        logging.getLogger("decant").warning("a line")
+    finally:
+        root.handlers, root.level = handlers, level  # type: ignore[misc]
+    assert datetime.fromisoformat(json.loads(stream.getvalue())["time"]).utcoffset() == timedelta(0)

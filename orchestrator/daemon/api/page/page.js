@@ -8,6 +8,7 @@ import {
 
 const $ = (id) => document.getElementById(id);
 const RUNNING = ["preparing", "running", "pausing", "waiting for operator", "stopping"];
+const WAITING = ["queued", "checking"];
 const BEAT = 2000, SILENCE = 6000;
 /* How often the daemon is called [ms], and after which silence the page no longer relies on it. */
 const PHYSICAL = "press the physical emergency stop: the red mushroom button on the teach pendant";
@@ -122,7 +123,8 @@ function link(up) {
   if (up) now.heard = Date.now();
   const changed = up !== now.up;
   now.up = up;
-  $("link").textContent = up ? `connected, ${clock(now.heard / 1000)}` : "NO CONNECTION";
+  const person = now.status?.person;
+  $("link").textContent = up ? `connected, ${clock(now.heard / 1000)}${person ? `, ${person.name} (${person.role})` : ""}` : "NO CONNECTION";
   if (!changed) return;
   $("lost").hidden = up;
   $("lost").replaceChildren(...(up ? [] : [
@@ -142,17 +144,17 @@ function show() {
   const { status, campaigns } = now;
   const real = status.rigs.filter((rig) => rig.mode === "hardware");
   draw($("mode"), real.map((rig) => rig.name), (names) => names.length ?
-    [modeBadge("hardware"), ` ${names.join(", ")}: a real arm`] : [modeBadge("virtual"), " nothing real moves"]);
+    [modeBadge("hardware"), el("span", { class: "words" }, ` ${names.join(", ")}: a real arm`)] : [modeBadge("virtual"), el("span", { class: "words" }, " nothing real moves")]);
   document.body.classList.toggle("real", real.length > 0);
   showStops();
   showEmergencies();
   showQuestions();
   const byId = Object.fromEntries(campaigns.map((one) => [one.id, one]));
   const rigs = status.rigs.filter((rig) => rig.mode !== "none" || rig.campaign).map((rig) => [rig, byId[rig.campaign] || null]);
-  draw(body("rigs"), [rigs, status.problems, status.ready], () => [
+  draw(body("rigs"), [rigs, status.problems, status.ready, stops(), now.up], () => [
     status.problems.map((problem) => el("p", { class: "problem" }, problem)),
     status.ready || status.problems.length || stops().length ? null : el("p", { class: "quiet" }, "The simulators are starting."),
-    rigs.map(([rig, campaign]) => rigCard(rig, campaign, acts)),
+    rigs.map(([rig, campaign]) => rigCard(rig, campaign, { stopped: Boolean(status.emergency || rig.emergency), several: status.rigs.filter((one) => one.mode !== "none").length > 1, up: now.up }, allowed())),
   ]);
   $("racks").hidden = !now.racks.length;
   draw(body("racks"), now.racks.map(({ name }) => name), () => now.racks.map(rackFigure));
@@ -162,10 +164,10 @@ function show() {
   draw(body("night"), now.night, (events) => events.length ? nightTimeline(events) : []);
   $("vessels").hidden = !now.vessels.length;
   draw(body("vessels"), now.vessels, vesselsTable);
-  const queued = campaigns.filter((one) => one.state === "queued");
-  draw(body("queue"), [queued, status.queue_paused], ([items, paused]) => queueList(items, paused, acts));
-  const ended = campaigns.filter((one) => one.state !== "queued" && !RUNNING.includes(one.state)).slice(0, 8);
-  draw(body("ended"), ended, (items) => endedList(items, acts));
+  const queued = campaigns.filter((one) => WAITING.includes(one.state));
+  draw(body("queue"), [queued, status.queue_paused], ([items, paused]) => queueList(items, paused, allowed()));
+  const ended = campaigns.filter((one) => !WAITING.includes(one.state) && !RUNNING.includes(one.state)).slice(0, 8);
+  draw(body("ended"), ended, (items) => endedList(items, allowed()));
   const open = now.questions.length;
   document.title = stops().length ? "STOPPED – Decant" : open ? `(${open}) question – Decant` : "Decant";
 }
@@ -191,7 +193,7 @@ function showEmergencies() {
   const queued = now.campaigns.filter((one) => one.state === "queued");
   const waiting = (stop) => queued.filter((one) => !stop.rig || one.rig === stop.rig).length;
   draw($("emergency"), [found, now.clearing, found.map(waiting)], ([all, asking]) =>
-    all.map((stop) => stopCard(stop, asking === stop.rig, waiting(stop), acts)));
+    all.map((stop) => stopCard(stop, asking === stop.rig, waiting(stop), allowed())));
 }
 
 function showQuestions() {
@@ -201,7 +203,7 @@ function showQuestions() {
     const key = String(question.id);
     if (known.delete(key)) continue; // what somebody is typing stays
     const campaign = now.campaigns.find((one) => one.id === question.campaign)?.name || question.campaign;
-    const card = questionCard(question, campaign, modes[question.rig] || "virtual", acts.answer);
+    const card = questionCard(question, campaign, modes[question.rig] || "virtual", allowed().answer);
     section.append(card);
     const free = document.activeElement === document.body || document.activeElement === $("main");
     if (free) card.querySelector("h2").focus({ preventScroll: true });
@@ -255,6 +257,15 @@ async function stop(rig) {
   if (!done) alarm(`${what} was not confirmed: ${PHYSICAL}.`);
 }
 
+const ROLES = ["viewer", "operator", "admin"];
+const NEEDS = { answer: "operator", end: "operator", resume: "operator", earlier: "operator", hold: "operator", note: "operator", askClear: "admin", clear: "admin" };
+
+/** What the person who is signed in may do: buttons for the rest are not shown. */
+function allowed() {
+  const role = ROLES.indexOf(now.status?.person.role);
+  return Object.fromEntries(Object.entries(acts).filter(([name]) => role >= ROLES.indexOf(NEEDS[name] || "viewer")));
+}
+
 const of = (item, command) => call(`campaigns/${encodeURIComponent(item.id)}/${command}`, undefined, { method: "POST" });
 const acts = {
   answer: async (question, text) => { await call(`questions/${question.id}/answer`, { answer: text }); soon(0); },
@@ -287,7 +298,7 @@ async function find() {
   const query = new URLSearchParams([["limit", 8], ...$("words").value.split(/\s+/).filter(Boolean).map((word) => ["words", word])]);
   await doing("look for runs", async () => {
     const runs = await call(`runs?${query}`, undefined, { timeout: 60000 });
-    draw(body("previous"), runs, (found) => previousRuns(found, acts));
+    draw(body("previous"), runs, (found) => previousRuns(found, allowed()));
     body("previous").hidden = false;
   });
 }
@@ -355,6 +366,10 @@ new ResizeObserver(() => { // what gets the focus is not covered by the header
   document.documentElement.style.scrollPaddingTop = `${$("head").offsetHeight + 8}px`;
 }).observe($("head"));
 
+$("zone").textContent = `Times are in the zone of this browser: ${Intl.DateTimeFormat().resolvedOptions().timeZone}.`;
+
 function come() { if (knownToken()) enter(); else leave(); }
-addEventListener("hashchange", () => { if (location.hash.includes("token=")) come(); });
+addEventListener("hashchange", () => { // another person may do other things: everything is drawn anew
+  if (location.hash.includes("token=") && knownToken()) location.reload();
+});
 come();

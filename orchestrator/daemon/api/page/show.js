@@ -57,9 +57,11 @@ export function cellLine(rig, campaign, { stopped, several, mixed, up }, acts) {
     MOVING.includes(rig.checkpoint) ? "arm moves" : stateText(campaign.state);
   return el("li", { class: rig.mode },
     el("span", {}, el("b", {}, rig.name), mixed ? [" ", modeBadge(rig.mode)] : "", up ? ": " : " (last known): ", state),
-    several ? el("button", { type: "button", class: "emergency one", "data-key": `stop ${rig.name}`, disabled: !up,
-      onclick: () => acts.stopRig(rig.name) }, `STOP ${rig.name}`) : null);
+    several ? stopButton(rig, up, acts) : null);
 }
+
+const stopButton = (rig, up, acts, look = "") => el("button", { type: "button", class: `emergency one ${look}`,
+  "data-key": `stop ${look} ${rig.name}`, disabled: !up, onclick: () => acts.stopRig(rig.name) }, `STOP ${rig.name}`);
 
 /** A latched emergency stop. Clearing it is one question, whose answer "No" has the focus. */
 export function stopCard(stop, asking, waiting, acts) {
@@ -77,7 +79,7 @@ export function stopCard(stop, asking, waiting, acts) {
     el("div", { class: "answers" },
       button(`keep ${stop.rig}`, "No, stay stopped", async () => acts.askClear(null), "big go"),
       button(`clear ${stop.rig}`, "Yes, clear the stop", () => acts.clear(stop.rig), "plain danger")),
-  ] : button(`ask ${stop.rig}`, all ? "Clear the stop" : `Clear the stop of ${stop.rig}`, async () => acts.askClear(stop.rig), "plain danger"));
+  ] : !acts.askClear ? el("p", {}, "An administrator clears it.") : button(`ask ${stop.rig}`, all ? "Clear the stop" : `Clear the stop of ${stop.rig}`, async () => acts.askClear(stop.rig), "plain danger"));
 }
 
 const sentence = (text) => /[.?!]$/.test(text) ? text : `${text}.`;
@@ -90,15 +92,17 @@ function armStatus(arm) {
     arm.advice ? ` ${sentence(arm.advice[0].toUpperCase() + arm.advice.slice(1))}` : "");
 }
 
-export function rigCard(rig, campaign, acts) {
+/** One rig: its campaign, and how to pause or end it. On narrow screens, which have no room for them in the header, also its stop. */
+export function rigCard(rig, campaign, { stopped, several, up }, acts) {
   const idle = !campaign;
   const progress = campaign?.progress;
   return el("article", { class: `card ${rig.mode}`, "aria-label": `rig ${rig.name}` },
-    el("h3", {}, rig.name, " ", modeBadge(rig.mode)),
+    el("h3", {}, rig.name, " ", modeBadge(rig.mode), stopped ? [" ", el("strong", { class: "badge stopped" }, "STOPPED")] : ""),
+    several ? stopButton(rig, up, acts, "narrow") : null,
     armStatus(rig.arm),
     idle ? el("p", { class: "quiet" }, "Nothing runs here.") : [
       el("p", { class: "what" }, el("b", {}, campaign.name), ` ${stateText(campaign.state)}`,
-        campaign.desired_state !== "run" ? ` (asked to ${campaign.desired_state})` : ""),
+        campaign.desired_state !== "run" ? ` (asked to ${campaign.desired_state})` : "", followers(campaign)),
       progress ? [
         el("p", {}, progress.stage ? `${progress.stage} (stage ${progress.stage_index} of ${progress.stage_count})` : "",
           progress.seconds_left ? `, about ${lasting(progress.seconds_left)} left` : ""),
@@ -112,7 +116,7 @@ export function rigCard(rig, campaign, acts) {
         campaign.live ? el("a", { href: campaign.live, target: "_blank", rel: "noreferrer", "data-key": `live ${campaign.id}` },
           "Live view") : null,
         campaign.report ? button(`report ${campaign.id}`, "Save report", () => acts.report(campaign.id), "plain") : null),
-      el("div", { class: "grades" },
+      !acts.end ? null : el("div", { class: "grades" },
         button(`pause ${campaign.id}`, "Pause", () => acts.end(campaign, "pause"), "grade"),
         button(`stop ${campaign.id}`, "Finish and end", () => acts.end(campaign, "stop"), "grade"),
         button(`abort ${campaign.id}`, "Stop the motion", () => acts.end(campaign, "abort"), "grade danger")),
@@ -126,7 +130,7 @@ function bar(what, done, of) {
 
 const NAMES = { done: "Done", yes: "Yes", no: "No", lost: "Lost: outcome unknown", repeat: "Pour it again", accept: "Leave it as it is", correct: "Correct the other amounts", "[]": "No more mixtures" };
 
-/** A question with answers that a wet finger hits. `send` takes the answer and throws what is wrong with it. */
+/** A question with answers that a wet finger hits. `send` takes the answer and throws what is wrong with it; without it, others answer. */
 export function questionCard(question, campaign, mode, send) {
   const problem = el("p", { class: "problem", role: "alert" }, question.problem || "");
   const answer = async (text) => {
@@ -138,8 +142,8 @@ export function questionCard(question, campaign, mode, send) {
     el("p", { class: "quiet" }, modeBadge(mode), ` ${campaign} at ${question.rig}, asked at ${clock(question.asked)}`),
     el("h2", { id: head, tabindex: "-1" }, question.text), problem,
     question.hands ? el("p", { class: "hands" }, "Hands go into the cell: the arm stands still until you answer.") : null,
-    question.about === "vessels_laid_out" ? null : details(question.details), el("div", { class: "answers" }, answers(question, answer)));
-  if (question.kind === "bench") card.append(el("details", {}, el("summary", {}, "This pour can't be made"),
+    question.about === "vessels_laid_out" ? null : details(question.details), send ? el("div", { class: "answers" }, answers(question, answer)) : el("p", {}, "An operator answers."));
+  if (send && question.kind === "bench") card.append(el("details", {}, el("summary", {}, "This pour can't be made"),
     button(`give-up-${question.id}`, "Give it up", () => answer("give up"), "plain danger")));
   return card;
 }
@@ -238,14 +242,18 @@ export function nightTimeline(events) {
 const cell = (head, text, meaning = "") =>
   el("td", { "data-head": head }, String(text), meaning ? el("span", { class: "meaning" }, ` ${meaning}`) : null);
 
+const followers = (item) => item.followers.length ? `, followed by ${item.followers.join(", ")}` : "";
+
 export function queueList(items, paused, acts) {
   return [
     el("p", {}, paused ? el("b", {}, "The queue is held: nothing begins. ") : "", items.length ? "" : "Nothing waits. ",
-      button("hold", paused ? "Let it go on" : "Hold the queue", () => acts.hold(!paused), "plain")),
+      !acts.hold ? null : button("hold", paused ? "Let it go on" : "Hold the queue", () => acts.hold(!paused), "plain")),
     items.length ? el("ol", {}, items.map((item, index) => el("li", {}, el("span", {}, el("b", {}, item.name), " ",
-      modeBadge(item.mode), ` for ${item.rig}`, item.needs_enabling ? ", waits for `decant queue enable`" : ""),
-    index ? button(`up ${item.id}`, "Earlier", () => acts.earlier(item, items[index - 1]), "plain") : null,
-    button(`drop ${item.id}`, "Take out", () => acts.end(item, "stop"), "plain danger")))) : null,
+      modeBadge(item.mode), ` for ${item.rig}`, item.needs_enabling ? ", waits for `decant queue enable`" : "",
+      item.after ? `, after ${item.after.campaign}${item.after.verdict === "any" ? "" : ` if it is ${item.after.verdict}`}` : "", followers(item)),
+    item.state === "checking" ? "is being checked" : "",
+    index && acts.earlier && item.state === "queued" ? button(`up ${item.id}`, "Earlier", () => acts.earlier(item, items[index - 1]), "plain") : null,
+    !acts.end ? null : button(`drop ${item.id}`, "Take out", () => acts.end(item, "stop"), "plain danger")))) : null,
   ];
 }
 
@@ -253,8 +261,8 @@ export function endedList(items, acts) {
   if (!items.length) return el("p", { class: "quiet" }, "None.");
   return el("ul", {}, items.map((item) => el("li", {},
     el("span", {}, el("b", {}, item.name), " ", modeBadge(item.mode), ` ${stateText(item.state)}`,
-      item.reason ? `: ${item.reason}` : "", item.ended ? `, ${clock(item.ended)}` : ""),
-    ["paused", "failed", "unknown", "stopped"].includes(item.state) ?
+      item.reason ? `: ${item.reason}` : "", followers(item), item.ended ? `, ${clock(item.ended)}` : ""),
+    acts.resume && ["paused", "failed", "unknown", "stopped"].includes(item.state) ?
       button(`resume ${item.id}`, "Go on", () => acts.resume(item), "plain") : null,
     item.report ? button(`report ${item.id}`, "Save report", () => acts.report(item.id), "plain") : null)));
 }
@@ -286,7 +294,7 @@ export function previousRuns(runs, acts) {
     el("span", {}, el("b", {}, run.run), " ", modeBadge(run.mode), ` ${day(run.begun)}, ${stateText(run.state)}, ${run.pours} pours`,
       ` of ${run.liquid.join(", ")}, best: ${best(run)}`,
       run.notes.map((note) => el("p", { class: "quiet" }, note))),
-    button(`note ${run.run}`, "Note", () => acts.note(run), "plain"),
+    !acts.note ? null : button(`note ${run.run}`, "Note", () => acts.note(run), "plain"),
     button(`previous ${run.run}`, "Save report", () => acts.previousReport(run), "plain"))));
 }
 

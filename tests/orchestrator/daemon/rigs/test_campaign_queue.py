@@ -22,6 +22,7 @@ import pytest
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
+from actors.interfaces import OperatorQuestion
 from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
 from orchestrator.cli import queue_commands
 from orchestrator.cli.app import app
@@ -29,10 +30,12 @@ from orchestrator.cli.queue_commands import submit
 from orchestrator.daemon.api.daemon_client import Client
 from orchestrator.daemon.rigs.pour_request import SubmissionIn
 from orchestrator.daemon.rigs.submissions import Submission, SubmissionError, pack, prepare, run_request
+from orchestrator.daemon.state.access_tokens import Role
 from orchestrator.daemon.state.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.state.daemon_store import QueueItem
 from orchestrator.daemon.state.run_readout import Pours
 from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.reports.progress_state import CHECKPOINT_WORDS
 from orchestrator.runs.run_service import RunHandle, RunRequest
 from sim_engine.prediction_band import CalibrationResidual
 from tests.support.small_campaign import NARROW, write_campaign
@@ -380,7 +383,10 @@ def test_a_campaign_waits_for_its_earliest_start_and_says_so(
             monkeypatch.setattr(queue_commands, "connected_client", lambda *where: contextlib.nullcontext(client))
             for key in (None, late):
                 queue_commands.list_campaigns(key)
-                assert found["waits_for"] in capsys.readouterr().out, key
+                shown = capsys.readouterr().out
+                assert f"its earliest start, {queue_commands.local_time(start.timestamp())}" in shown, key
+                assert shown.count(time.strftime("%Z", time.localtime(start.timestamp()))) >= 2
+                assert "+00:00" not in shown
             await served.post(f"/campaigns/{late}/move", {"not_before": 0})
             await served.until(late, "finished")
 
@@ -415,6 +421,9 @@ def test_an_earliest_start_in_milliseconds_is_refused_with_both_readings() -> No
     with pytest.raises(ValidationError, match=text):
         SubmissionIn.model_validate({"not_before": 1000 * now})
     assert SubmissionIn.model_validate({"not_before": now + 60}).not_before == now + 60
+
+
+PERSON_AT_BENCH = "  arm: {kind: simulated}\n  balance: {kind: simulated}\n  operator: {answers: person}\n  bench:"
 
 
 def _held_check(monkeypatch: pytest.MonkeyPatch, go: threading.Event, error: str = "") -> list[str]:
@@ -581,3 +590,47 @@ def test_a_submission_without_a_response_is_sent_again_with_its_id(
         client._http = httpx.Client(base_url=client.url, transport=httpx.MockTransport(respond))
         assert client.submit({"id": "a", "text": "b"}) == {"id": "a"}
     assert seen[0] == seen[1]
+
+
+def test_a_shutdown_says_what_it_waits_for_and_that_a_second_one_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def work() -> None:
+        async with serving(tmp_path, held) as served:
+            key = await served.submit()
+            laboratory = await served.pouring()
+            ending = await served.post("/shutdown", role=Role.ADMIN)
+            assert ending["waits_for"] == [
+                f"{key} at rig virtual: the pour under way, which is weighed (now {CHECKPOINT_WORDS['tilt']})"
+            ]
+            assert not ending["at_once"]
+            client = SimpleNamespace(post=lambda path: ending)
+            monkeypatch.setattr(queue_commands, "connected_client", lambda *where: contextlib.nullcontext(client))
+            queue_commands.shutdown()
+            told = capsys.readouterr()
+            assert ending["waits_for"][0] in told.out
+            assert "a second 'decant server stop' does not wait" in told.err
+            served.daemon.stopping = True
+            assert (await served.post("/shutdown", role=Role.ADMIN))["at_once"]
+            laboratory.bench.go.set()
+
+    run(work())
+
+
+def test_a_shutdown_names_the_open_question(tmp_path: Path) -> None:
+    def asking() -> HeldLaboratory:
+        laboratory = held()
+        laboratory.bench.question = OperatorQuestion(about="refill", text="Fill the pourer", wants="done", hands=True)
+        return laboratory
+
+    async def work() -> None:
+        async with serving(tmp_path, asking) as served:
+            served.campaign.write_text(CAMPAIGN.replace("  bench:", PERSON_AT_BENCH).replace("scale: 0", "scale: 50"))
+            await served.submit()
+            question = await served.question()
+            (line,) = (await served.post("/shutdown", role=Role.ADMIN))["waits_for"]
+            assert f"the answer to question {question['id']}" in line
+            assert line.endswith("Fill the pourer")
+            await served.post(f"/questions/{question['id']}/answer", {"answer": "done"})
+
+    run(work())

@@ -31,7 +31,7 @@ from tests.orchestrator.daemon.integrations.test_sila_server import needs_cdk, s
 from tests.support.browser import OnPort, on_port
 from tests.support.hypothesis_examples import examples
 from tests.support.stop_requests import CASES, FORMS, PATH, StopCase, connected, head_of, response, sent, stopped_by
-from tests.support.toy_daemon import held, run, serving
+from tests.support.toy_daemon import CAMPAIGN, held, run, serving
 from tests.support.waiting import PATIENCE, wait_for
 
 DECANT = [sys.executable, "-c", "from orchestrator.cli.app import main; main()"]
@@ -254,7 +254,7 @@ def two_rigs(folder: Path) -> tuple[Rig, ...]:
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OnPort]:
     folder = tmp_path_factory.mktemp("pair")
-    with on_port(folder, rigs=two_rigs(folder)) as found:
+    with on_port(folder, campaign=CAMPAIGN, rigs=two_rigs(folder)) as found:
         yield found
 
 

@@ -1,0 +1,115 @@
+BEGIN TRANSACTION;
+CREATE TABLE chain (seq integer primary key, digest blob not null) strict;
+INSERT INTO "chain" VALUES(1,X'AC7A2B90A545A48079236E7582AB2B49ECF1944F83C6D1FB6F6BC9405E9975AC');
+INSERT INTO "chain" VALUES(2,X'580CFFAC2B38CD2322E798BF63A0343CD64E5DC86D5B37AA1E4B6E55B520BE5F');
+INSERT INTO "chain" VALUES(3,X'AE5B9851243E68C0443C3978235174F2423E99615E14C95982E8828FB10F59E1');
+INSERT INTO "chain" VALUES(4,X'18960A5EC237114782594BDF05003903FA7CE9388C3C15D5837BD5A4844BD13C');
+INSERT INTO "chain" VALUES(5,X'E091D660B64D28D2A717C1BE977E801D28B36D5696178B1F6B1A179F9E0621F3');
+INSERT INTO "chain" VALUES(6,X'8879004D84826C606F3CDEBF2EDA56CC5EBB7E68F8B76584BCCF25EEA0328989');
+INSERT INTO "chain" VALUES(7,X'493EC689F798E7C4696ED0470E21F6F246F83AD6BBFF1BD734250E5FB0C80061');
+INSERT INTO "chain" VALUES(8,X'90C66C22660F216E6E16514287F7AE19519190B2E90F081433AEE10F3BBFF054');
+INSERT INTO "chain" VALUES(9,X'EFF9DF97A47D3E4E73A8C0BEA183EF01DE38D2483D93F2F1ABCF9A08820A02AD');
+INSERT INTO "chain" VALUES(10,X'620F88709833890F6436E44BDB584EF2BDC2BDBD47D75F71C7A49F2C4F1274CC');
+INSERT INTO "chain" VALUES(11,X'3CA13751ADEE5CF40ACA106CA516810792E21C27A8B0D8BD9269A10CE267F6C8');
+INSERT INTO "chain" VALUES(12,X'C0E89527D2190C97498B5819B773CFA323CFE942C1C01F8B86C6B917B11CE65A');
+INSERT INTO "chain" VALUES(13,X'08D3AA35315AB8FA63CBF9DD8F92FC8FFD0032DAE3B621B28D88D3B9E0468DB7');
+INSERT INTO "chain" VALUES(14,X'3E6C30AF66123694B57E302FAC1591AEA01991348E785B57B1556660554DD82A');
+INSERT INTO "chain" VALUES(15,X'48E91BC636700E4716EB70C2346944B36DFA1B53079DDA85F6D390A87F604B19');
+INSERT INTO "chain" VALUES(16,X'8FDC0D6378357172B26791B63CF4C4D42B3FC359EC848DBB42967AAB304AE25D');
+INSERT INTO "chain" VALUES(17,X'7F8E61849F8D8211731C603DDB454753132267F4B55010CAECBD059ED34C573D');
+INSERT INTO "chain" VALUES(18,X'9F57A45F4575E01C419AA2E7D44CF6BA7366D72EB25BADC009FF4DDD682A5212');
+INSERT INTO "chain" VALUES(19,X'C17C592E4ED861ECE21EE1AD1C6DCAED7A4CEE6D0112F3FE256FA1402AC349B7');
+INSERT INTO "chain" VALUES(20,X'76698EC45A6413304F857E763F884A940534F5849CBE4DB9A7EAAEDFD3BE9FAC');
+INSERT INTO "chain" VALUES(21,X'0952E1FB60EDFB8D582D442B3501054B6CDCAB4942E86F6ACDAECA8712FC05EA');
+INSERT INTO "chain" VALUES(22,X'3B7E4CAC9C40F88609128E0DBC8410859CEE3D5B960901D04DB8C073E1328423');
+INSERT INTO "chain" VALUES(23,X'8B4EF7B15B5B9B3587CC1F3B384BE649EEA1A62D929BC5F58B7B4B90ECE0A9EE');
+INSERT INTO "chain" VALUES(24,X'0C3579DFB30AE7EF50FA47DA888196FB0F24BE5206E429A3235CB0F6ED3E6C75');
+INSERT INTO "chain" VALUES(25,X'57B9BEC66FE56B1586C6E9E6140C82C70916A25A7FCE3FB41E8E27E1A67B94E6');
+INSERT INTO "chain" VALUES(26,X'800398C347C95E1A50E8F0D454B6BB17B72606E40729AB41E44DDEBBA48C2857');
+INSERT INTO "chain" VALUES(27,X'FA5AE490EDA2955C16B24573B830435602C9B1A5922B8ED7E00396C09FA7B869');
+INSERT INTO "chain" VALUES(28,X'42337CFE532324F1CEBF29DF5E5EFF5482A484E17CD180AB181237952F26F579');
+INSERT INTO "chain" VALUES(29,X'BEBA656AE5F7A0598527D400F8DE1501C8051F607D8750EBE4C1DD1D0740BAD1');
+INSERT INTO "chain" VALUES(30,X'AAD938E0CB8659A3DAC6852C15B1878340EB4521BE12CA2BDBD4B783301863ED');
+INSERT INTO "chain" VALUES(31,X'56F178F1B08217FD6142D6257973DC3E25AD1CE6B35127C89CC3444B02C3A59F');
+INSERT INTO "chain" VALUES(32,X'BCEAF35E38BE3D619D43123F778A02AC0233579270F3D2D36D0504904555926D');
+INSERT INTO "chain" VALUES(33,X'612E4258AFD2CAADE3305EF10804027726121A897E0567E46827E8547F8D5511');
+INSERT INTO "chain" VALUES(34,X'001CD7C6E7BF8F860A9CE67CD01AC7EC4DFCE4F81421331823D4722324BDCE46');
+INSERT INTO "chain" VALUES(35,X'E703C3F717A1BCB7899811E002AC875D25F867BE4BE0AA5E8C260D0CEAC04037');
+INSERT INTO "chain" VALUES(36,X'F3FD6F48A671BD68FC08E62ABD72DBF6D847065FBECB9C08DDB72D8670FAC4BB');
+INSERT INTO "chain" VALUES(37,X'64F1E7B635D02221208FB86FFA31CFB0D76097CD4B0CDFC2D4D75B0D5AE46EBB');
+INSERT INTO "chain" VALUES(38,X'AA02382D02962D0101A4AA36BEB0FC4600BBB72A68F2F84C7881D2D4CB8CE198');
+INSERT INTO "chain" VALUES(39,X'52E037E2BB3CC13FD44CF188C6C55E70ACBFD5EB6576E22396294A0069F7F452');
+INSERT INTO "chain" VALUES(40,X'C300F794A147E0F72AD155A9429757171327ED95E6B922F506C1C57AFFD0B8A6');
+INSERT INTO "chain" VALUES(41,X'E0B098E42ECD235400B439A000C45AEBD68D7CE289CBCE122BE133BE412AFA1F');
+INSERT INTO "chain" VALUES(42,X'633037A0065151F0E677FF4CD25E9C2D784D1521A9B77E49418E623FCB661A57');
+INSERT INTO "chain" VALUES(43,X'B9D201166D62366F1FBED3907A6A500259B43B7700388B70B9E2601438EE71A9');
+INSERT INTO "chain" VALUES(44,X'84352CE34CCC35227A9D08F454C2350B2F1536844C59C2314A92E536E5C175C0');
+INSERT INTO "chain" VALUES(45,X'8E143E65E2EF82D1551CCF3A5438E75D79CD217F63595E196F0938819FD8D823');
+INSERT INTO "chain" VALUES(46,X'31D0FE50828FED994C375DF34F55ABCCE26E3F32A0DA1F20948694ED32B1CE4A');
+CREATE TABLE event (
+    seq integer primary key, stage text not null, t real not null, kind text not null,
+    body text not null check (json_valid(body))
+) strict;
+INSERT INTO "event" VALUES(1,'',1.79581013356724476814e+09,'campaign.state','{"after":"preparing","before":"queued","pid":22923,"reason":"begun"}');
+INSERT INTO "event" VALUES(2,'',1.79581013357949805259e+09,'campaign.state','{"after":"running","before":"preparing","pid":22923,"reason":""}');
+INSERT INTO "event" VALUES(3,'deployment:narrow',1.79581013358077383043e+09,'stage.opened','{"seed":1943047303464832138}');
+INSERT INTO "event" VALUES(4,'deployment:narrow',1.79581013358279967303e+09,'asked','{"ids":[1],"pours":1,"simulations":2}');
+INSERT INTO "event" VALUES(5,'deployment:narrow',1.79581013358279967303e+09,'requested','{"id":1,"request":{"purpose":"start","query":{"constraints":[],"count":1,"failed":[],"infeasible":[],"known":[],"pending":[],"refused":[],"seed":1020142019,"space":{"axes":[{"integer":false,"lower":1.0471975511965976,"name":"angular_velocity","scale":"linear","upper":3.141592653589793},{"integer":false,"lower":0.06,"name":"x_offset","scale":"linear","upper":0.1}]},"type":"SpaceFillingQuery"},"type":"Suggest"}}');
+INSERT INTO "event" VALUES(6,'deployment:narrow',1.79581013366814684867e+09,'started','{"id":1}');
+INSERT INTO "event" VALUES(7,'deployment:narrow',1.79581013378257966042e+09,'finished','{"id":1,"outcome":{"suggestion":{"bands":[],"best_deviation":null,"best_mean":null,"best_noise":null,"best_point":null,"deviations":[],"discrepancy":null,"feasibilities":[],"gains":[],"hyperparameters":null,"means":[],"noises":[],"points":[[0.7005422141889197,0.5274986960613854]],"posterior":null,"prediction_deviations":[],"predictions":[],"risk":null,"seconds":0.6119734063724558,"surrogate":null,"uncertainty":null},"type":"Suggested"},"seconds":0.029037419999440317}');
+INSERT INTO "event" VALUES(8,'deployment:narrow',1.79581013380596780774e+09,'told','{"id":1}');
+INSERT INTO "event" VALUES(9,'deployment:narrow',1.79581013380596780774e+09,'decision','{"text":"pour 1/3  angular_velocity 144.1 deg/s  x_offset 81.1 mm","urgent":false,"values":{}}');
+INSERT INTO "event" VALUES(10,'deployment:narrow',1.79581013382868957522e+09,'asked','{"ids":[2],"pours":1,"simulations":2}');
+INSERT INTO "event" VALUES(11,'deployment:narrow',1.79581013382868957522e+09,'requested','{"id":2,"request":{"action":{"angular_acceleration":10.471975511965978,"angular_velocity":2.5144097336135562,"height":0.06,"hold_time":0.3,"max_angle":2.007128639793479,"return_velocity":3.141592653589793,"x_offset":0.08109994784245542,"y_offset":0.0},"number":1,"predicted":null,"purpose":"pour","scene":"deployment-narrow","seed":2011465947,"type":"Pour"}}');
+INSERT INTO "event" VALUES(12,'deployment:narrow',1.79581013389841604235e+09,'pour.started','{"attempt":1,"id":2,"number":1}');
+INSERT INTO "event" VALUES(13,'deployment:narrow',1.79581013391294026368e+09,'pour.finished','{"id":2,"outcome":{"measurement":{"loaded":0.1,"notes":{"seed":2011465947},"retained":0.001,"spilled":0.057277599947135376},"type":"Poured"},"seconds":0.012005767000118794}');
+INSERT INTO "event" VALUES(14,'deployment:narrow',1.79581013392469501493e+09,'told','{"id":2}');
+INSERT INTO "event" VALUES(15,'deployment:narrow',1.79581013392469501493e+09,'decision','{"text":"pour 1: loss 0.5828","urgent":false,"values":{"loss":0.5827759994713537}}');
+INSERT INTO "event" VALUES(16,'deployment:narrow',1.79581013392864561077e+09,'asked','{"ids":[3],"pours":1,"simulations":2}');
+INSERT INTO "event" VALUES(17,'deployment:narrow',1.79581013392864561077e+09,'requested','{"id":3,"request":{"purpose":"start","query":{"constraints":[],"count":1,"failed":[],"infeasible":[],"known":[[0.7005422141889197,0.5274986960613854]],"pending":[],"refused":[],"seed":59188370,"space":{"axes":[{"integer":false,"lower":1.0471975511965976,"name":"angular_velocity","scale":"linear","upper":3.141592653589793},{"integer":false,"lower":0.06,"name":"x_offset","scale":"linear","upper":0.1}]},"type":"SpaceFillingQuery"},"type":"Suggest"}}');
+INSERT INTO "event" VALUES(18,'deployment:narrow',1.79581013392921757694e+09,'started','{"id":3}');
+INSERT INTO "event" VALUES(19,'deployment:narrow',1.79581013395370340341e+09,'finished','{"id":3,"outcome":{"suggestion":{"bands":[],"best_deviation":null,"best_mean":null,"best_noise":null,"best_point":null,"deviations":[],"discrepancy":null,"feasibilities":[],"gains":[],"hyperparameters":null,"means":[],"noises":[],"points":[[0.25749721735507913,0.44019175254552156]],"posterior":null,"prediction_deviations":[],"predictions":[],"risk":null,"seconds":0.8089584113617198,"surrogate":null,"uncertainty":null},"type":"Suggested"},"seconds":0.013132091999978002}');
+INSERT INTO "event" VALUES(20,'deployment:narrow',1.79581013396020412447e+09,'told','{"id":3}');
+INSERT INTO "event" VALUES(21,'deployment:narrow',1.79581013396020412447e+09,'decision','{"text":"pour 2/3  angular_velocity 90.9 deg/s  x_offset 77.61 mm","urgent":false,"values":{}}');
+INSERT INTO "event" VALUES(22,'deployment:narrow',1.79581013396253228193e+09,'asked','{"ids":[4],"pours":1,"simulations":2}');
+INSERT INTO "event" VALUES(23,'deployment:narrow',1.79581013396253228193e+09,'requested','{"id":4,"request":{"action":{"angular_acceleration":10.471975511965978,"angular_velocity":1.5864984621049516,"height":0.06,"hold_time":0.3,"max_angle":2.007128639793479,"return_velocity":3.141592653589793,"x_offset":0.07760767010182086,"y_offset":0.0},"number":2,"predicted":null,"purpose":"pour","scene":"deployment-narrow","seed":1348726893,"type":"Pour"}}');
+INSERT INTO "event" VALUES(24,'deployment:narrow',1.79581013396321940425e+09,'pour.started','{"attempt":1,"id":4,"number":2}');
+INSERT INTO "event" VALUES(25,'deployment:narrow',1.79581013396899938578e+09,'pour.finished','{"id":4,"outcome":{"measurement":{"loaded":0.1,"notes":{"seed":1348726893},"retained":0.001,"spilled":0.03628863573203452},"type":"Poured"},"seconds":0.005700990999685018}');
+INSERT INTO "event" VALUES(26,'deployment:narrow',1.79581013397670125964e+09,'told','{"id":4}');
+INSERT INTO "event" VALUES(27,'deployment:narrow',1.79581013397670125964e+09,'decision','{"text":"pour 2: loss 0.3729","urgent":false,"values":{"loss":0.3728863573203452}}');
+INSERT INTO "event" VALUES(28,'deployment:narrow',1.79581013398648548125e+09,'asked','{"ids":[5],"pours":1,"simulations":2}');
+INSERT INTO "event" VALUES(29,'deployment:narrow',1.79581013398648548125e+09,'requested','{"id":5,"request":{"purpose":"start","query":{"constraints":[],"count":1,"failed":[],"infeasible":[],"known":[[0.7005422141889197,0.5274986960613854],[0.25749721735507913,0.44019175254552156]],"pending":[],"refused":[],"seed":1439636799,"space":{"axes":[{"integer":false,"lower":1.0471975511965976,"name":"angular_velocity","scale":"linear","upper":3.141592653589793},{"integer":false,"lower":0.06,"name":"x_offset","scale":"linear","upper":0.1}]},"type":"SpaceFillingQuery"},"type":"Suggest"}}');
+INSERT INTO "event" VALUES(30,'deployment:narrow',1.79581013398707699775e+09,'started','{"id":5}');
+INSERT INTO "event" VALUES(31,'deployment:narrow',1.79581013399331784253e+09,'finished','{"id":5,"outcome":{"suggestion":{"bands":[],"best_deviation":null,"best_mean":null,"best_noise":null,"best_point":null,"deviations":[],"discrepancy":null,"feasibilities":[],"gains":[],"hyperparameters":null,"means":[],"noises":[],"points":[[0.27121777674273323,0.6999912997128661]],"posterior":null,"prediction_deviations":[],"predictions":[],"risk":null,"seconds":0.9992023153833124,"surrogate":null,"uncertainty":null},"type":"Suggested"},"seconds":0.006132483999863325}');
+INSERT INTO "event" VALUES(32,'deployment:narrow',1.79581013400237488744e+09,'told','{"id":5}');
+INSERT INTO "event" VALUES(33,'deployment:narrow',1.79581013400237488744e+09,'decision','{"text":"pour 3/3  angular_velocity 92.55 deg/s  x_offset 88 mm","urgent":false,"values":{}}');
+INSERT INTO "event" VALUES(34,'deployment:narrow',1.79581013400424551957e+09,'asked','{"ids":[6],"pours":1,"simulations":2}');
+INSERT INTO "event" VALUES(35,'deployment:narrow',1.79581013400424551957e+09,'requested','{"id":6,"request":{"action":{"angular_acceleration":10.471975511965978,"angular_velocity":1.6152347344885492,"height":0.06,"hold_time":0.3,"max_angle":2.007128639793479,"return_velocity":3.141592653589793,"x_offset":0.08799965198851464,"y_offset":0.0},"number":3,"predicted":null,"purpose":"pour","scene":"deployment-narrow","seed":2085606843,"type":"Pour"}}');
+INSERT INTO "event" VALUES(36,'deployment:narrow',1.79581013400478935234e+09,'pour.started','{"attempt":1,"id":6,"number":3}');
+INSERT INTO "event" VALUES(37,'deployment:narrow',1.79581013403424406046e+09,'pour.finished','{"id":6,"outcome":{"measurement":{"loaded":0.1,"notes":{"seed":2085606843},"retained":0.001,"spilled":0.03694934583592565},"type":"Poured"},"seconds":0.029355059999943478}');
+INSERT INTO "event" VALUES(38,'deployment:narrow',1795810134.04936,'told','{"id":6}');
+INSERT INTO "event" VALUES(39,'deployment:narrow',1795810134.04936,'decision','{"text":"pour 3: loss 0.3795","urgent":false,"values":{"loss":0.37949345835925646}}');
+INSERT INTO "event" VALUES(40,'deployment:narrow',1.79581013405623078345e+09,'asked','{"ids":[7],"pours":1,"simulations":2}');
+INSERT INTO "event" VALUES(41,'deployment:narrow',1.79581013405623078345e+09,'requested','{"id":7,"request":{"purpose":"conclude","query":{"constraints":[],"data":{"costs":[0.5827759994713537,0.3728863573203452,0.37949345835925646],"points":[[0.7005422141889197,0.5274986960613854],[0.25749721735507913,0.44019175254552156],[0.27121777674273323,0.6999912997128661]]},"failed":[],"infeasible":[],"kappa":2.0,"map_at":[],"map_resolution":25,"mean":"constant","predict_at":[],"refused":[],"seed":1742036036,"space":{"axes":[{"integer":false,"lower":1.0471975511965976,"name":"angular_velocity","scale":"linear","upper":3.141592653589793},{"integer":false,"lower":0.06,"name":"x_offset","scale":"linear","upper":0.1}]},"type":"RegressionQuery"},"type":"Suggest"}}');
+INSERT INTO "event" VALUES(42,'deployment:narrow',1.79581013405679941179e+09,'started','{"id":7}');
+INSERT INTO "event" VALUES(43,'deployment:narrow',1.79581013408313727381e+09,'finished','{"id":7,"outcome":{"suggestion":{"bands":[],"best_deviation":null,"best_mean":null,"best_noise":null,"best_point":null,"deviations":[],"discrepancy":null,"feasibilities":[],"gains":[],"hyperparameters":null,"means":[],"noises":[],"points":[[0.4359647565624057,0.7035214371915293]],"posterior":null,"prediction_deviations":[],"predictions":[],"risk":null,"seconds":0.4697844998627515,"surrogate":null,"uncertainty":null},"type":"Suggested"},"seconds":0.02617690399983985}');
+INSERT INTO "event" VALUES(44,'deployment:narrow',1.79581013408430266377e+09,'told','{"id":7}');
+INSERT INTO "event" VALUES(45,'deployment:narrow',1.7958101340850851536e+09,'stage.closed','{"result":{"bench":null,"ended":null,"failed_pours":0,"former_pours":0,"gave_up":null,"kind":"deployment","loss":"spilled_and_retained","map":null,"model_check":{"alarm":false,"z_scores":[]},"objectives":[],"pours":[{"action":{"angular_velocity_deg_s":144.06506570267038,"x_offset_mm":81.09994784245542},"action_si":{"angular_velocity":2.5144097336135562,"x_offset":0.08109994784245542},"delivered_g":41.72240005286463,"delivered_ml":41.806012077018664,"loaded_g":100.0,"loss":0.5827759994713537,"number":1,"objectives":{},"predicted":null,"predicted_deviation":null,"predicted_interval":null,"predicted_scatter":null,"reason":"","retained_g":1.0,"spillage":0.57856161562763,"spilled_g":57.27759994713538,"status":"weighed"},{"action":{"angular_velocity_deg_s":90.8996660826095,"x_offset_mm":77.60767010182086},"action_si":{"angular_velocity":1.5864984621049516,"x_offset":0.07760767010182086},"delivered_g":62.71136426796547,"delivered_ml":62.837038344654786,"loaded_g":100.0,"loss":0.3728863573203452,"number":2,"objectives":{},"predicted":null,"predicted_deviation":null,"predicted_interval":null,"predicted_scatter":null,"reason":"","retained_g":1.0,"spillage":0.36655187608115675,"spilled_g":36.28863573203452,"status":"weighed"},{"action":{"angular_velocity_deg_s":92.54613320912797,"x_offset_mm":87.99965198851464},"action_si":{"angular_velocity":1.6152347344885492,"x_offset":0.08799965198851464},"delivered_g":62.05065416407435,"delivered_ml":62.17500417241919,"loaded_g":100.0,"loss":0.37949345835925646,"number":3,"objectives":{},"predicted":null,"predicted_deviation":null,"predicted_interval":null,"predicted_scatter":null,"reason":"","retained_g":1.0,"spillage":0.3732257155144005,"spilled_g":36.94934583592565,"status":"weighed"}],"recommended":null,"refused_pours":0,"risk":null,"scene":"deployment-narrow","simulated":[],"simulations":0,"simulations_lost":0,"simulations_refused":0,"strategy":"D2"}}');
+INSERT INTO "event" VALUES(46,'',1.79581013409335589403e+09,'campaign.state','{"after":"finished","before":"running","pid":22923,"reason":""}');
+CREATE TABLE header (
+    format integer not null, name text not null, fingerprint text not null check (json_valid(fingerprint)),
+    created real not null
+) strict;
+INSERT INTO "header" VALUES(4,'cup','{"calibration":null,"deployment":{"actions":{"axes":[{"integer":false,"lower":1.0471975511965976,"name":"angular_velocity","scale":"linear","upper":3.141592653589793},{"integer":false,"lower":0.06,"name":"x_offset","scale":"linear","upper":0.1}]},"bench":[],"confirm":0,"constraints":[],"data":null,"left_over":null,"loss":{"name":"spilled_and_retained","retained_weight":1.0},"objectives":null,"scenes":[{"fixed":{"angular_acceleration":10.471975511965978,"height":0.06,"hold_time":0.3,"max_angle":2.007128639793479,"return_velocity":3.141592653589793,"y_offset":0.0},"liquid":{"density":998.0,"mass":0.1,"name":"water"},"max_hold_time":5.0,"name":"deployment-narrow","pivot":{"kind":"lip","x":0.0,"z":0.0},"pourer":{"name":"beaker","shape":{"floor":0.004,"inner":[[0.0,0.0],[0.03,0.0],[0.03,0.07]],"kind":"profile","wall":0.004}},"receiver":{"name":"narrow","shape":{"floor":0.004,"inner":[[0.0,0.0],[0.02,0.0],[0.02,0.09]],"kind":"profile","wall":0.004}}}],"settings":{"initial_samples":3,"kappa":2.0,"mean":"constant","pours":3,"strategy":"D2"},"thetas":[]},"laboratory":{"arm":null,"balance":null,"bench":{"balance":{"drift":0.0,"noise":0.0001,"resolution":0.0001,"settling_time":1.5},"liquid":{"cohesion":0.02,"friction":0.0,"particles":400,"rim_correction":0.5,"smagorinsky_constant":0.17,"viscosity_factor":1.0,"wall_distance":0.5,"xsph_rate":3.0},"operator_time":85.0,"pose_error":{"speed_factor":1.0,"tilt":0.0,"x":0.0,"y":0.0,"z":0.0},"pose_noise":{"speed_factor":0.0,"tilt":0.0,"x":0.0,"y":0.0,"z":0.0},"time_scale":0.0},"cell":null,"mode":"virtual","name":"numbers"},"name":"cup","parallel_simulations":2,"parameters":{"cohesion":0.02,"friction":0.0,"particles":300,"receiver_x":0.0,"receiver_y":0.0,"receiver_z":0.0,"rim_correction":0.5,"smagorinsky_constant":0.17,"speed_factor":1.0,"tilt_zero":0.0,"viscosity_factor":1.0,"wall_distance":0.5,"xsph_rate":3.0},"seed":3}',1.7958101333617608547e+09);
+CREATE INDEX event_by_stage on event (stage, seq);
+CREATE TRIGGER event_is_never_changed before update on event
+    begin select raise(abort, 'the journal is append-only'); end;
+CREATE TRIGGER event_is_never_deleted before delete on event
+    begin select raise(abort, 'the journal is append-only'); end;
+CREATE TRIGGER chain_is_never_changed before update on chain
+    begin select raise(abort, 'the journal is append-only'); end;
+CREATE TRIGGER chain_is_never_deleted before delete on chain
+    begin select raise(abort, 'the journal is append-only'); end;
+COMMIT;
+pragma user_version = 0;
+pragma application_id = 0;
