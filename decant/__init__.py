@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from decant.running import starting_set as starting_set
     from decant.simulation import Simulation as Simulation
     from decant.simulation import simulate as simulate
+    from decant.simulation import simulate_many as simulate_many
     from decant.station import Station as Station
     from decant.station import StationPour as StationPour
     from orchestrator.campaigns.action_assignments import AssignmentError as AssignmentError

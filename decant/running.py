@@ -362,13 +362,13 @@ def plan(
         if value < 1:
             raise InvalidArgumentError(f"{name}={value!r}: should be 1 or more")
     vessel = load_vessel(Path(receiver).expanduser()) if isinstance(receiver, str | Path) else receiver
-    chosen = _given(theta, campaign)
+    chosen = given_theta(theta, campaign)
     request = plan_task(campaign, chosen, vessel, iterations, seeds)
     return _run(request, checked(request, RunResources(in_process=in_process, subscribers=watch)))
 
 
-def _given(theta: SimulationParameters | Run | Path | str | None, campaign: CampaignPlan) -> GivenTheta:
-    """θ to plan with, and what else its calibration found."""
+def given_theta(theta: SimulationParameters | Run | Path | str | None, campaign: CampaignPlan) -> GivenTheta:
+    """θ as `plan` and `simulate` accept it, and what else its calibration found."""
     if theta is None:
         return GivenTheta(campaign.parameters)
     if isinstance(theta, SimulationParameters):

@@ -29,6 +29,7 @@ from actors.bench.ground_truth import GroundTruth
 from actors.bench.held_vessel import HeldVessel, HoldingArm
 from actors.bench.liquid_supply import LiquidSupply, PumpDevice, SpillWatch
 from actors.bench.night_consent import NightConsent
+from actors.bench.pour_feasibility import path_of
 from actors.bench.pour_procedure import BenchProcedure, PourProcedure
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
 from actors.bench.vessel_carrying import VesselCarrier
@@ -173,10 +174,9 @@ class PouringBench:
         return DoseProcedure(self._setup, scene, dose, path, seed=seed, settings=self._dosing, progress=progress)
 
     def _checked(self, scene: Scene, action: Action) -> PlannedPour:
-        try:
-            return arm_kind(self._arm_spec).plan(scene, action)
-        except ValueError as error:
-            raise InvalidActionError(str(error)) from error
+        path = path_of(scene, action, self._arm_spec)
+        assert path is not None
+        return path
 
 
 MakeDevice = Callable[..., Device]

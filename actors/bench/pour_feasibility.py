@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 
+from actors.arm.arm_interface import PlannedPour
+from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.interfaces import InvalidActionError
 from sim_engine.action import Action
 from sim_engine.motion import PourMotion, plan_motion
@@ -37,3 +39,26 @@ def plan_pour(scene: Scene, action: Action) -> PourMotion:
     except (ValueError, OSError) as error:
         raise InvalidActionError(str(error)) from error
     return motion
+
+
+def path_of(scene: Scene, action: Action, arm: ArmSettings | None) -> PlannedPour | None:
+    """Check an action, by the arm that will make it if there is one. Every command that tries an action calls this.
+
+    Args:
+        scene: vessels and liquid.
+        action: how to pour.
+        arm: of the laboratory; None: the pour only has to be possible.
+
+    Returns:
+        The arm's path; None without an arm.
+
+    Raises:
+        InvalidActionError: the pour is impossible, or the arm can't make it.
+    """
+    if arm is None:
+        plan_pour(scene, action)
+        return None
+    try:
+        return arm_kind(arm).plan(scene, action)
+    except ValueError as error:
+        raise InvalidActionError(str(error)) from error

@@ -33,7 +33,7 @@ class JobCancelledError(Exception):
 
 
 class Simulator(Protocol):
-    """The engine's interface for a job runner; `sim_engine.simulator.PourSimulator` implements it."""
+    """The engine's interface for a job runner; `sim_engine.shared_simulator.SharedSimulator` implements it."""
 
     def simulate(self, task: PourTask, *, cancelled: Callable[[], bool] | None = None) -> SimulatedPour:
         """Run one pour."""
@@ -45,12 +45,12 @@ class Simulator(Protocol):
 
 
 def pour_simulator() -> Simulator:
-    """Create the engine's simulator. Importing and starting it compiles kernels, so call this in the process that uses
-    it.
+    """Create the engine's simulator, which threads of a process can share. Importing and starting it compiles kernels,
+    so call this in the process that uses it.
     """
-    from sim_engine.simulator import PourSimulator
+    from sim_engine.shared_simulator import SharedSimulator
 
-    return PourSimulator()
+    return SharedSimulator()
 
 
 class JobRunner:

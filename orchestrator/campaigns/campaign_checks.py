@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from actors.arm.arm_settings import ArmSettings, arm_kind
+from actors.bench.pour_feasibility import path_of
 from actors.bench.pour_feasibility import vessel as built
 from actors.grippers.gripper_interface import GripperSettings
 from actors.interfaces import DoseTarget, InvalidActionError, LaboratoryError, UnreachablePlaceError
@@ -447,7 +448,7 @@ class _Checker:
         if self.arm is None:
             return ""
         try:
-            arm_kind(self.arm).plan(scene, action)
+            path_of(scene, action, self.arm)
         except InvalidActionError as error:
             if isinstance(error, UnreachablePlaceError):
                 barred.add(_place(action))
@@ -463,8 +464,8 @@ class _Checker:
         self._carried(scene, role)
         try:
             problem = touch(scene, action := scene.action({}), *vessels)
-            if problem is None and self.arm is not None:
-                arm_kind(self.arm).plan(scene, action)
+            if problem is None:
+                path_of(scene, action, self.arm)
         except (InvalidActionError, ValueError) as error:
             problem = str(error)
         if problem is not None:
@@ -496,7 +497,7 @@ class _Checker:
                     self.add(role.places(), f"an arm of the kind '{self.arm.kind}' can't pour wanted amounts")
                     continue
                 try:
-                    arm_kind(self.arm).plan(scene, scene.action({}))
+                    path_of(scene, scene.action({}), self.arm)
                 except InvalidActionError as error:
                     self.add(role.places(("motion",)), f"{role.text}: the arm can't make the tilt: {error}")
         if plan.mixtures is not None:

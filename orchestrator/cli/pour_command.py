@@ -131,7 +131,7 @@ def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | No
     Raises:
         RefusalError: it can't be made (exit code 2).
     """
-    from actors.arm.arm_settings import arm_kind
+    from actors.bench.pour_feasibility import path_of
     from actors.interfaces import InvalidActionError
     from orchestrator.campaigns.action_assignments import assigned_action
     from orchestrator.campaigns.campaign_checks import check_vessels
@@ -146,12 +146,10 @@ def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | No
         raise RefusalError("\n".join(map(str, problems)))
     if not plan.laboratory.pours:
         raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans")
-    planned = None
-    if plan.laboratory.arm is not None:
-        try:
-            planned = arm_kind(plan.laboratory.arm).plan(scene, action)
-        except (InvalidActionError, ValueError) as error:
-            raise RefusalError(f"{action.display()}: {error}") from None
+    try:
+        planned = path_of(scene, action, plan.laboratory.arm)
+    except InvalidActionError as error:
+        raise RefusalError(f"{action.display()}: {error}") from None
     return Chosen(plan, scene, action, planned)
 
 

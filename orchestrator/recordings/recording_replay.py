@@ -30,6 +30,7 @@ from sim_engine.errors import InvalidSceneError
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.motion import recorded_motion
 from sim_engine.scene import PourTask, Scene
+from sim_engine.shared_simulator import SharedSimulator
 from sim_engine.simulator import PourSimulator
 from sim_engine.vessel.shapes import ProfileShape, VesselSpec
 from sim_engine.vessel.vessel import build_vessel, check_holds
@@ -149,7 +150,7 @@ def simulate(
     times, tilts = _while_it_flows(recording)
     motion = recorded_motion(scene, action, pourer, receiver, times, tilts + place.grip + values.grip)
     task = PourTask(scene, action, parameters or SimulationParameters(particles=1000), seed, motion=motion)
-    pool = simulator or PourSimulator()
+    pool = simulator or SharedSimulator()
     try:
         outcome = pool.simulate(task).outcome
     finally:

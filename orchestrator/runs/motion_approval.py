@@ -18,8 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from actors.arm.arm_interface import PathReport
-from actors.arm.arm_settings import ArmSettings, SafetyRecord, arm_kind
+from actors.arm.arm_settings import ArmSettings, SafetyRecord
 from actors.arm_geometry import JOINT_NAMES
+from actors.bench.pour_feasibility import path_of
 from actors.interfaces import InvalidActionError
 from actors.optimizer.questions import Linear
 from orchestrator.learning.calibration.action_prior import actions_all_over
@@ -171,8 +172,10 @@ def envelope(arm: ArmSettings, pours: Iterable[tuple[Scene, Action]]) -> Envelop
     reports, refused = [], []
     for scene, action in pours:
         try:
-            reports.append(arm_kind(arm).plan(scene, action).report)
-        except (InvalidActionError, ValueError) as error:
+            path = path_of(scene, action, arm)
+            assert path is not None
+            reports.append(path.report)
+        except InvalidActionError as error:
             refused.append(f"{action.display()}: {error}")
     return Envelope(tuple(reports), tuple(refused))
 
