@@ -154,23 +154,22 @@ class SharedClock(DeviceClock):
         self._numbers[_NOW] += seconds
         self._numbers[_WRITTEN] = time.monotonic()
 
-    @property
-    def allowed(self) -> float:
-        """Time until the first promise ends [s]. The clock waits there, but neither for a process that has ended nor
-        longer than `LONGEST_STAND` of wall time.
+    def may_pass(self, seconds: float) -> bool:
+        """Whether so much time may pass now [s]: not beyond a promise.
+
+        The clock waits neither for a process that has ended nor longer than `LONGEST_STAND` of wall time.
         """
-        left = min(self._numbers[_place(program)] for program in PROGRAMS) - self._numbers[_NOW]
-        if left > 0.0:
+        after = self._numbers[_NOW] + seconds
+        late = [program for program in PROGRAMS if self._numbers[_place(program)] < after]
+        if not late:
             self._stands_since = None
-            return left
+            return True
         self._stands_since = self._stands_since or time.monotonic()
         hangs = time.monotonic() - self._stands_since > LONGEST_STAND
-        for program in PROGRAMS:
-            place = _place(program)
-            late = self._numbers[place] <= self._numbers[_NOW]
-            if late and (hangs or not _lives(int(self._numbers[place + 1]))):
+        for program in late:
+            if hangs or not _lives(int(self._numbers[_place(program) + 1])):
                 self.withdraw(program)
-        return left
+        return False
 
 
 def _place(program: str) -> int:

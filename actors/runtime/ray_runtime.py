@@ -46,8 +46,10 @@ from actors.runtime.ray_cleanup import GOODBYE, MARK, end_cluster
 if TYPE_CHECKING:
     import psutil  # type: ignore[import-untyped,unused-ignore]  # its stubs are a package of their own
 
-START_DEADLINE = 120.0
-"""Longest time that Ray may take to start [s]; a busy machine with a cold disk needs twenty."""
+START_DEADLINE, JOIN_DEADLINE = 600.0, 120.0
+"""Longest time that a private Ray may take to start, and the connection to a running one [s]: three on an idle machine,
+more than 120 on one core next to twenty other programs.
+"""
 
 LOOK_INTERVAL = 2.0
 """Time between two checks whether a private Ray still treats this program as alive [s]."""
@@ -335,11 +337,12 @@ def _start_keeper(session: _Session, start: RayStart) -> None:
     """
     session.keeper = threading.Thread(target=_keep, args=(session, start), name="ray-keeper", daemon=True)
     session.keeper.start()
-    if not session.ready.wait(START_DEADLINE):
+    deadline = START_DEADLINE if session.private else JOIN_DEADLINE
+    if not session.ready.wait(deadline):
         set_here = [] if session.private else [name for name in _CONNECTION_SETTINGS if os.environ.get(name)]
         hint = f" Set for the connection are {', '.join(set_here)}: are they so on the cluster?" if set_here else ""
         raise LaboratoryError(
-            f"Ray did not start within {START_DEADLINE:.0f} s; is this machine busy, or short of memory? Try again, or "
+            f"Ray did not start within {deadline:.0f} s; is this machine busy, or short of memory? Try again, or "
             f"do without Ray (--in-process).{hint}"
         )
     if session.failure is not None:

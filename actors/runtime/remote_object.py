@@ -60,7 +60,7 @@ LOOK_INTERVAL = 20.0
 LOOK_DEADLINE = 60.0
 """A process that has replied before counts as lost if it does not reply for this time [s]."""
 
-START_DEADLINE = 120.0
+START_DEADLINE = 600.0
 """Longest time for a process to start [s]; a busy machine needs long. Deadlines of calls begin after it."""
 
 

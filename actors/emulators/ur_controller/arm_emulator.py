@@ -9,8 +9,10 @@ import os
 import random
 import shutil
 import socket
+import struct
 import tempfile
 import time
+from base64 import b64decode
 from pathlib import Path
 from typing import Any
 
@@ -93,10 +95,12 @@ class UrEmulator:
             DeviceLostError: the controller does not reply.
         """
         try:
-            answer = self._controller.fault("history", since=since, timeout=REPLY_TIMEOUT)
+            answer = self._controller.fault("samples", since=since, timeout=REPLY_TIMEOUT)
         except VirtualControllerError as error:
             raise DeviceLostError(f"what the virtual arm did is not known: {error}") from error
-        return History(tuple(answer["times"]), tuple(tuple(q) for q in answer["joints"]), float(answer["now"]))
+        samples = struct.iter_unpack("7d", b64decode(answer["samples"]))
+        moments = [(t, joints) for t, *joints in samples]
+        return History(tuple(t for t, _ in moments), tuple(tuple(q) for _, q in moments), float(answer["now"]))
 
     def fault(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """See `ArmEmulator.fault`, and docs/reference/virtual-devices.md."""

@@ -212,7 +212,7 @@ class Host:
     def _runs(self, period: float) -> bool:
         """Whether time passes: not while a program is loaded, or while the bench waits for a program that is late."""
         return not self.connections.uploads.translating and (
-            self._shared is None or self.connections.silent or self._shared.allowed > period
+            self._shared is None or self.connections.silent or self._shared.may_pass(period)
         )
 
     def _tick(self, period: float) -> None:

@@ -5,12 +5,18 @@ live with.
 from __future__ import annotations
 
 import socket
+import struct
 import time
+from base64 import b64decode
 from collections.abc import Callable
 
 import pytest
 
 from actors.emulators.ur_controller import VirtualController, VirtualControllerError
+from actors.emulators.ur_controller.control_clock import Host
+from actors.emulators.ur_controller.controller import Controller
+from actors.emulators.ur_controller.fault_injection import ControllerFaults
+from actors.emulators.ur_controller.robot import MODELS
 from tests.actors.emulators.ur_controller.conftest import Client, observe
 from tests.support.waiting import wait_for
 
@@ -321,3 +327,17 @@ def test_a_client_that_dies_leaves_the_watchdog_to_stop_the_arm(fresh: Start) ->
 def test_an_unknown_fault_is_told_with_those_there_are(shared: VirtualController) -> None:
     with pytest.raises(VirtualControllerError, match=r"no fault 'pizza'.*protective_stop"):
         shared.fault("pizza")
+
+
+def test_the_motion_is_read_as_doubles_as_well_so_that_two_minutes_of_it_do_not_hold_up_the_clock() -> None:
+    """Text of two minutes took so long on a busy machine that clients gave up their connections."""
+    controller = Controller(MODELS["ur10e"], frequency=125.0)
+    for _ in range(300):
+        controller.tick()
+    faults = ControllerFaults(Host(controller, "127.0.0.1"))
+    history, samples = (faults.call({"fault": name, "since": 0.5}) for name in ("history", "samples"))
+    moments = list(struct.iter_unpack("7d", b64decode(samples["samples"])))
+    assert [t for t, *_ in moments] == history["times"]
+    assert [q for _, *q in moments] == history["joints"]
+    assert len(moments) > 100
+    assert samples["now"] == history["now"]
