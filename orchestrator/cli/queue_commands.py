@@ -240,12 +240,13 @@ def _standing(item: dict[str, Any]) -> str:
     progress = item["progress"]
     if progress is None:
         reason = str(item["reason"]).split("\n", maxsplit=1)[0][:100]
+        verdict = item["verdict"]["text"] if item["verdict"] else ""
         waits_for = item["waits_for"]
         if item["not_before"] and waits_for.startswith(
             "its earliest start"
         ):  # in the zone of this machine, as the rest
             waits_for = f"its earliest start, {local_time(item['not_before'])}"
-        return " · ".join(filter(None, (reason, waits_for and f"waits for: {waits_for}")))
+        return " · ".join(filter(None, (verdict, reason, waits_for and f"waits for: {waits_for}")))
     parts = [f"{progress['stage']} ({progress['stage_index']}/{progress['stage_count']})"] if progress["stage"] else []
     if progress["of_pours"]:
         parts.append(f"{progress['pours']}/{progress['of_pours']} pours")
@@ -262,6 +263,10 @@ def _show(key: str, url: str | None, state: Path | None, as_json: bool) -> None:
         print_json(item)
         return
     print(f"{item['id']}: {item['state']}  ({item['task']} on {item['rig']}, {item['mode']})")
+    if item["verdict"] is not None:
+        print(f"  verdict    {item['verdict']['text']}")
+        for goal in item["verdict"]["unmet"]:
+            print(f"             {', '.join(goal['of'])}: {goal['reason']}")
     for name in ("reason", "run", "live"):
         if item[name]:
             print(f"  {name:10s} {item[name]}")
@@ -322,6 +327,7 @@ def _line(event: dict[str, Any]) -> str | None:
             text = f"{event['before']} → {event['after']}" + (f": {event['reason']}" if event["reason"] else "")
         case "CampaignRests":
             text = f"rests: {event['state']}" + (f": {event['reason']}" if event["reason"] else "")
+            text += f"; {event['verdict']['text']}" if event.get("verdict") else ""
         case "StageOpened":
             text = f"stage {event['stage']} ({event['index']}/{event['count']})"
         case "RequestFinished":

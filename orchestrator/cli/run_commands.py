@@ -135,6 +135,7 @@ def list_runs(asked: RunsAsked, state: State = None, as_json: Json = False) -> N
             "begun": _date(run["begun"]),
             "mode": _mode(run["mode"]),
             "state": run["state"],
+            "verdict": run["verdict"] or "",
             "strategies": ", ".join(run["strategy"]),
             "liquid": ", ".join(run["liquid"]),
             "from": ", ".join(run["pourer"]),
@@ -226,6 +227,7 @@ def show(run: Which, state: State = None, as_json: Json = False) -> None:
     lines = {
         "run": f"{entry['run']}  {_mode(entry['mode'])}",
         "state": f"{entry['state']}{': ' + entry['reason'] if entry['reason'] else ''}",
+        "verdict": entry["reached"].get("text", ""),
         "begun": f"{_date(entry['begun'])}, ended {_date(entry['ended'])}",
         "campaign": f"{entry['campaign']}, seed {entry['seed']}, laboratory {entry['laboratory']}",
         "strategies": ", ".join(entry["strategy"]),

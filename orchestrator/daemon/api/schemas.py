@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from orchestrator.daemon.rigs.pour_request import AfterIn, Moment, RequestModel
 from orchestrator.learning.dispense import MixedComponent
+from orchestrator.records.verdict import Verdict
 from orchestrator.reports.run_summary import PourSummary
 
 
@@ -121,6 +122,9 @@ class CampaignOut(ResponseModel):
     desired_state: str
     """run, pause, stop or abort."""
 
+    verdict: Verdict | None
+    """What its run reached, once it is at rest; null before, and without a run."""
+
     reason: str
     by: str
     created: float
@@ -134,9 +138,6 @@ class CampaignOut(ResponseModel):
 
     not_before: float | None
     """Earliest start."""
-
-    verdict: Literal["complete", "incomplete", "nothing"] | None
-    """What its run reached, once it has ended."""
 
     after: AfterOut | None
     """Campaign that has to end before it starts."""

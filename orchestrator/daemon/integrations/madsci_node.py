@@ -37,7 +37,7 @@ from orchestrator.daemon.rigs.ordering import Ordering
 from orchestrator.daemon.rigs.pour_request import JsonModel, PourIn, SubmissionIn, described, problems_text
 from orchestrator.daemon.rigs.supervisor import Supervisor
 from orchestrator.daemon.state.daemon_settings import MadsciSettings, networks
-from orchestrator.daemon.state.daemon_store import ENDED, QueueItem
+from orchestrator.daemon.state.daemon_store import ENDED, QueueItem, is_complete, verdict_text
 from orchestrator.learning.run_errors import RunError
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 
@@ -53,7 +53,7 @@ _STATUS = {"weighed": "succeeded", "failed": "failed", "unknown": "unknown", "ca
 """Status words of MADSci for the states of a pour; in all others it is 'running'."""
 
 _CAMPAIGN_STATUS = {
-    "finished": "succeeded",
+    "finished": "succeeded",  # with the verdict 'complete' only
     "failed": "failed",
     "unknown": "unknown",
     "stopped": "cancelled",
@@ -274,7 +274,10 @@ class MadsciNode:
         item = self._queue.item(action.campaign)
         if action.name == "run_campaign":
             status, reason = _CAMPAIGN_STATUS.get(item.state, "running"), item.reason or ""
+            if status == "succeeded" and not is_complete(item.verdict):
+                status, reason = "failed", verdict_text(item.verdict)
             about: dict[str, Any] = {"campaign": item.id, "state": item.state, "run": item.run, "reason": reason}
+            about["verdict"] = item.verdict
         else:
             about = await self._ordering.pour_out(action.id)
             status, reason = _status_of(about), str(about["reason"] or "")
@@ -428,8 +431,10 @@ def _refused(text: str) -> dict[str, Any]:
 
 
 def _status_of(pour: dict[str, Any]) -> str:
-    """Status word of a pour. An unknown outcome that no operator can state any more is a failure."""
-    if pour["state"] == "unknown" and pour["result"] is not None:
+    """Status word of a pour. An unknown outcome that no operator can state any more is a failure, and so is an amount
+    beyond its tolerance."""
+    result = pour["result"]
+    if result is not None and (pour["state"] == "unknown" or result.get("within_tolerance") is False):
         return "failed"
     return _STATUS.get(pour["state"], "running")
 

@@ -33,6 +33,7 @@ from unitelabs.cdk import Connector, ConnectorBaseConfig, Logger, SiLAServerConf
 
 from orchestrator.daemon.api.daemon_client import Client, DaemonError, order_body
 from orchestrator.daemon.rigs.pour_request import PourIn
+from orchestrator.daemon.state.daemon_store import is_complete, verdict_text
 from orchestrator.learning.run_errors import RunError
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 
@@ -79,7 +80,7 @@ class DaemonUnreachableError(RunError):
 
 
 class OrderFailedError(RunError):
-    """The pour or the campaign has failed; the message gives the reason."""
+    """The pour or the campaign has failed or has not reached what was wanted; the message gives the reason."""
 
 
 class OrderCancelledError(RunError):
@@ -498,6 +499,10 @@ def _refuse(error: DaemonError) -> NoReturn:
 def _has_ended(state: dict[str, Any]) -> bool:
     """Whether a pour or a campaign has ended well; another end is an error."""
     match state["state"]:
+        case "weighed" if (state["result"] or {}).get("within_tolerance") is False:
+            raise OrderFailedError(state["reason"])
+        case "finished" if not is_complete(state["verdict"]):
+            raise OrderFailedError(verdict_text(state["verdict"]))
         case "weighed" | "finished":
             return True
         case "failed" | "refused":

@@ -226,8 +226,11 @@ class Ordering:
         }
 
     async def _state(self, item: QueueItem, row: dict[str, Any]) -> tuple[str, str]:
-        if row["result"] is not None:
-            return str(row["result"]["state"]), item.reason or str(row["result"]["end"])
+        if (result := row["result"]) is not None:
+            reason = item.reason or str(result["end"])
+            if result.get("within_tolerance") is False:
+                reason = f"missed its tolerance: {result['received_g']:.2f} g received, {result['error_g']:+.2f} g off"
+            return str(result["state"]), reason
         if item.state == "queued":
             return "queued", item.reason or self._queue.waits_for(item)
         if item.state in ("stopped", "withdrawn"):

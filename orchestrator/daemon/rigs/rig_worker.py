@@ -27,7 +27,7 @@ from orchestrator.daemon.state.daemon_settings import NO_RIG, DaemonSettings, Ri
 from orchestrator.daemon.state.daemon_store import ENDED, PAUSED, STOPPED, DesiredState, QueueItem, Store
 from orchestrator.daemon.state.event_feed import Feed
 from orchestrator.daemon.state.notifications import Counts
-from orchestrator.daemon.state.run_readout import Pours, found_at, prune_recordings
+from orchestrator.daemon.state.run_readout import Pours, found_at, prune_recordings, verdict_at
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.requests import Pour
 from orchestrator.learning.run_errors import RunError
@@ -39,7 +39,7 @@ from orchestrator.records.run_clock import run_time
 from orchestrator.records.run_record import CampaignResult, read_record
 from orchestrator.records.run_registry import make_state_directory
 from orchestrator.records.states import State
-from orchestrator.records.verdict import outcome_of, verdict_of
+from orchestrator.records.verdict import outcome_of
 from orchestrator.reports.progress_state import CHECKPOINT_WORDS, ProgressState
 from orchestrator.reports.publishing import publish_run, publish_so_far
 from orchestrator.reports.validity_warnings import not_simulated
@@ -123,9 +123,9 @@ class SharedServices:
             return ""
         if first.state not in ENDED:
             return f"the end of {first.id}, which is {first.state}"
-        if item.after["verdict"] == "any" or first.verdict == item.after["verdict"]:
+        if item.after["verdict"] == "any" or (first.verdict or {}).get("word") == item.after["verdict"]:
             return ""
-        reached = first.state if first.verdict is None else f"{first.state}, {first.verdict}"
+        reached = first.state if first.verdict is None else f"{first.state}, {first.verdict['word']}"
         wanted = item.after["verdict"]
         return f"an operator: {first.id} is {reached}, and has to be {wanted}; remove the condition, or take it out"
 
@@ -544,7 +544,8 @@ class RigWorker:
     async def _run(self, running: Running) -> None:
         store, feed, item = self._shared.store, self._shared.feed, running.item
         self._show_arm(None)
-        store.change(item.id, state="preparing", reason="", begun=item.begun or time.time(), motion_enabled=False)
+        begun = item.begun or time.time()
+        store.change(item.id, state="preparing", reason="", begun=begun, motion_enabled=False, verdict=None)
         feed.publish("CampaignLeased", {"rig": self.rig.name}, item.id)
         if self._shared.suspect and not any(w.running for w in self._shared.workers.values() if w is not self):
             self._shared.suspect = False
@@ -553,7 +554,7 @@ class RigWorker:
         result: CampaignResult | None = None
         try:
             result = await running.run(self._checksum(item))
-            state, reason = "finished", ""
+            state, reason, desired = "finished", "", DesiredState.RUN
         except asyncio.CancelledError:
             task = asyncio.current_task()
             if task is not None and task.cancelling():
@@ -596,16 +597,6 @@ class RigWorker:
         reason = stored.reason if stored is not None else ""
         return state, reason, desired
 
-    def _verdict(self, run: str | None) -> str | None:
-        """The verdict of a run, or None if it has none or its journal can't be read."""
-        if run is None:
-            return None
-        try:
-            return verdict_of(read_record(self._shared.settings.runs / run)).word
-        except (RunError, OSError, ValueError) as error:
-            _log.error("%s: no verdict: %s", run, error)
-            return None
-
     async def _leave(self, running: Running, state: str, reason: str, desired: DesiredState) -> None:
         store, key = self._shared.store, running.item.id
         if running.item.task == POUR:
@@ -617,14 +608,18 @@ class RigWorker:
             except Exception as error:  # what is in the journal is safe
                 reason = f"its results could not be published: {error}"
                 _log.exception("campaign %s: not published", key)
-        ended = time.time() if state in ENDED else None
-        verdict = await asyncio.to_thread(self._verdict, running.item.run) if ended is not None else None
+        ended, run = time.time() if state in ENDED else None, running.item.run
+        verdict = None if run is None else await asyncio.to_thread(verdict_at, self._shared.settings.runs / run)
         if state == "unknown":
             self._shared.counted["pours", self.rig.name, "unknown"] += 1
-        self._shared.counted["campaigns_ended", self.rig.name, verdict or state] += 1
+        word = state if verdict is None or ended is None else verdict["word"]
+        self._shared.counted["campaigns_ended", self.rig.name, word] += 1
         store.change(key, state=state, reason=reason, desired_state=str(desired), ended=ended, verdict=verdict)
         self.running = None  # whoever hears that it rests may have it go on
-        self._shared.feed.publish("CampaignRests", {"state": state, "reason": reason, "rig": self.rig.name}, key)
+        body = {"state": state, "reason": reason, "rig": self.rig.name, "verdict": verdict}
+        self._shared.feed.publish("CampaignRests", body, key)
+        if state == "finished" and (verdict is None or verdict["word"] != "complete"):
+            _log.warning("campaign %s: %s", key, "no verdict" if verdict is None else verdict["text"])
         self._shared.rested.set()
         self._shared.wake()  # campaigns of other rigs may wait for this one
         with contextlib.suppress(OSError):

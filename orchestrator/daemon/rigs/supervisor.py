@@ -19,8 +19,8 @@ from orchestrator.daemon.rigs.emergency_stop import EmergencyStops
 from orchestrator.daemon.rigs.pour_orders import OrderBook
 from orchestrator.daemon.rigs.rig_worker import SharedServices
 from orchestrator.daemon.state.daemon_settings import DaemonSettings
-from orchestrator.daemon.state.daemon_store import CHECKING
-from orchestrator.daemon.state.run_readout import violated_charts
+from orchestrator.daemon.state.daemon_store import AT_REST, CHECKING
+from orchestrator.daemon.state.run_readout import verdict_at, violated_charts
 from orchestrator.live_view.live_server import LiveView
 
 LEAVING = 10.0
@@ -74,6 +74,7 @@ class Supervisor:
             self._tasks.append(asyncio.create_task(worker.work(), name=f"rig {name}"))
             self._tasks.append(asyncio.create_task(worker.watch_arm(), name=f"arm of {name}"))
         self._tasks.append(asyncio.create_task(self._watch_charts(), name="charts"))
+        self._tasks.append(asyncio.create_task(self._judge(), name="verdicts"))
         if shared.settings.quick_start:
             self._tasks.append(asyncio.create_task(self._warm_up(), name="simulators"))
         shared.feed.publish("DaemonStarted", {"rigs": [rig.name for rig in shared.settings.rigs]})
@@ -111,6 +112,16 @@ class Supervisor:
                 body = {"laboratory": chart.laboratory, "mode": chart.mode, "quantity": chart.quantity}
                 self.shared.feed.publish("ChartViolated", {**body, "text": chart.text})
         self.shared.store.set_flag(REPORTED, reported)
+
+    async def _judge(self) -> None:
+        """Read the verdicts of campaigns at rest that have none: after a crash, or from earlier versions."""
+        store = self.shared.store
+        for item in store.items(AT_REST):
+            if item.run is None or item.verdict is not None:
+                continue
+            verdict = await asyncio.to_thread(verdict_at, self.shared.settings.runs / item.run)
+            if verdict is not None and self.shared.running(item) is None:
+                store.change(item.id, verdict=verdict)
 
     async def _warm_up(self) -> None:
         shared = self.shared

@@ -27,7 +27,10 @@ from orchestrator.records.run_registry import make_state_directory
 
 FORMAT = 6
 
-_UPGRADES = {5: "alter table campaign add column verdict text; alter table campaign add column after text;"}
+_UPGRADES = {
+    5: "alter table campaign add column verdict text check (verdict is null or json_valid(verdict));"
+    "alter table campaign add column after text;"
+}
 """Format → statements that convert it to the next one."""
 
 _SCHEMA = """
@@ -38,7 +41,7 @@ create table campaign (
     by text not null, created real not null, begun real, ended real, run text, motion_enabled integer not null,
     answers text not null check (json_valid(answers)),
     caller_id text not null default '', body_hash text not null default '', not_before real,
-    verdict text, after text check (after is null or json_valid(after))
+    verdict text check (verdict is null or json_valid(verdict)), after text check (after is null or json_valid(after))
 ) strict;
 create unique index campaign_by_caller_id on campaign (caller_id) where caller_id != '';
 create index campaign_by_state on campaign (state, rig);
@@ -145,7 +148,8 @@ class QueueItem:
         caller_id: id that its caller chose; '' without one.
         body_hash: digest of its caller's request, by which a repeated one is recognised.
         not_before: earliest start, seconds since 1970; None: at once.
-        verdict: of its run, once that has ended.
+        verdict: `orchestrator.records.verdict.Verdict` of its run as it came to rest, JSON-ready; None while it runs,
+            and without a run that can be read.
         after: id of the campaign that has to end before it, and the verdict that this needs: `campaign`, `verdict`.
     """
 
@@ -169,8 +173,18 @@ class QueueItem:
     caller_id: str = ""
     body_hash: str = ""
     not_before: float | None = None
-    verdict: str | None = None
+    verdict: dict[str, Any] | None = None
     after: dict[str, str] | None = None
+
+
+def is_complete(verdict: Mapping[str, Any] | None) -> bool:
+    """Whether a campaign's verdict says that it reached all that was wanted."""
+    return verdict is not None and verdict["word"] == "complete"
+
+
+def verdict_text(verdict: Mapping[str, Any] | None) -> str:
+    """The verdict in a line, also if there is none."""
+    return "its records can't be read, so that its verdict is unknown" if verdict is None else str(verdict["text"])
 
 
 class QuestionOut(BaseModel):
@@ -211,7 +225,7 @@ class QuestionOut(BaseModel):
         return self.closed is None
 
 
-_JSON = {"answers", "options", "details", "after"}
+_JSON = {"answers", "options", "details", "after", "verdict"}
 _BOOLEAN = {"motion_enabled", "hands"}
 
 

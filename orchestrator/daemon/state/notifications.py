@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
 
 from actors.laboratory_settings import MODE_LABELS
+from orchestrator.records.verdict import UnmetGoal
 from sim_engine.settings.model import Settings, Text
 from sim_engine.settings.quantity import Quantity
 
@@ -40,6 +41,9 @@ OCCASIONS: tuple[Occasion, ...] = get_args(Occasion)
 
 _FOR_PERSON = ("question", "failed", "silence")
 """Occasions that need a person."""
+
+MOST_LINES = 12
+"""Largest number of lines of a message about a campaign that ended."""
 
 _BY_PEOPLE = ("", "stopped on request")
 """Reasons of a campaign that an operator paused."""
@@ -75,8 +79,8 @@ class NotifySettings(Settings):
 
     about: list[Occasion] | None = None
     """Occasions for a message; all by default. `question`: an operator must answer; `ended`: a campaign is finished or
-    was stopped; `failed`: it can't continue, or a pour is UNKNOWN; `silence`: no news; `emergency`: an emergency stop;
-    `chart`: a quantity of the laboratory has left its limits.
+    was stopped, with its verdict; `failed`: it can't continue, or a pour is UNKNOWN; `silence`: no news; `emergency`:
+    an emergency stop; `chart`: a quantity of the laboratory has left its limits.
     """
 
     silence: Annotated[float, Quantity("s", "15 min", 1.0, 86_400.0, positive=True)] = 900.0
@@ -93,6 +97,8 @@ class Notification:
     occasion: Occasion
     title: str
     body: str
+    type: Literal["info", "warning"] = "info"
+    """As apprise has it: 'warning' for a campaign at rest whose verdict is not 'complete'."""
 
 
 @dataclass
@@ -222,21 +228,30 @@ class Notifier:
         state, reason = str(data["state"]), str(data.get("reason") or "")
         match state:
             case "unknown":
-                return self._made("failed", campaign, "a pour is UNKNOWN", [reason])
+                return self._made("failed", campaign, "a pour is UNKNOWN", [reason], warn=True)
             case "failed":
-                return self._made("failed", campaign, "failed", [reason])
+                return self._made("failed", campaign, "failed", [reason], warn=True)
             case "paused":
-                return None if reason in _BY_PEOPLE else self._made("failed", campaign, "can't go on", [reason])
-        return self._made("ended", campaign, f"is {state}", [reason])
+                if reason in _BY_PEOPLE:
+                    return None
+                return self._made("failed", campaign, "can't go on", [reason], warn=True)
+        verdict = data.get("verdict") or {"word": state, "text": "", "unmet": []}
+        lines = [str(verdict["text"]), reason, *(UnmetGoal.model_validate(goal).line for goal in verdict["unmet"])]
+        return self._made(
+            "ended", campaign, f"is {verdict['word']}", lines[:MOST_LINES], warn=verdict["word"] != "complete"
+        )
 
-    def _made(self, occasion: Occasion, campaign: str, headline: str, lines: Sequence[str]) -> Notification | None:
+    def _made(
+        self, occasion: Occasion, campaign: str, headline: str, lines: Sequence[str], *, warn: bool = False
+    ) -> Notification | None:
         news = self._news.get(campaign)
         if occasion not in self._about or (occasion in _FOR_PERSON and not self._first(news)):
             return None
         mode = f"{MODE_LABELS[news.mode]} " if news is not None and news.mode in MODE_LABELS else ""
         rig = "" if news is None or not news.rig else f" at {news.rig}"
         title = f"Decant: {headline}" if not campaign else f"Decant, {mode}{campaign}{rig}: {headline}"
-        return Notification(occasion, title, "\n".join(filter(None, (*lines, self._page))) or title)
+        body = "\n".join(filter(None, (*lines, self._page))) or title
+        return Notification(occasion, title, body, "warning" if warn else "info")
 
     def _watch_for_silence(self) -> None:
         while not self._ended.wait(min(max(self._silence / 10.0, 0.05), 30.0)):
@@ -346,7 +361,7 @@ class _Receiver:
             if attempt and self._ending.wait(PAUSES[attempt - 1]):
                 return False
             try:
-                if self._apprise.notify(title=message.title, body=message.body):
+                if self._apprise.notify(title=message.title, body=message.body, notify_type=message.type):
                     return True
             except Exception:  # apprise's plug-ins may raise anything
                 _log.debug("word to %s", self, exc_info=True)

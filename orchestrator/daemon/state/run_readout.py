@@ -1,6 +1,6 @@
 """Reads run folders and benches for the API; every function may take seconds and must not run in an event loop.
 
-- `Pours` and `summary_of` read the pours and the summary of a run.
+- `Pours`, `summary_of` and `verdict_at` read the pours, the summary and the verdict of a run.
 - `found_at` reads the arm and the balance after a crash, for the operator who decides the outcome of a pour. Nothing is
   moved or tared.
 - `violated_charts` reads the control charts that are out of control.
@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Sequence
@@ -30,12 +31,15 @@ from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.records.codec import CodecError
 from orchestrator.records.journal_file import JournalError
 from orchestrator.records.run_record import RunState, read_record
+from orchestrator.records.verdict import verdict_of
 from orchestrator.reports.html_report import REPORT_NAME as REPORT
 from orchestrator.reports.mixture_report import draw_rack, mixed_liquids, mixtures_so_far
 from orchestrator.reports.run_summary import PourSummary
 from orchestrator.reports.summarise import pour_summaries
 
 __all__ = ["REPORT", "Pours", "summary_of"]
+
+_log = logging.getLogger(__name__)
 
 
 def violated_charts(state: Path) -> list[LaboratoryChart]:
@@ -120,6 +124,15 @@ def summary_of(directory: Path) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     return summary
+
+
+def verdict_at(directory: Path) -> dict[str, Any] | None:
+    """Return the verdict of a run, JSON-ready; None if its journal can't be read."""
+    try:
+        return verdict_of(read_record(directory)).model_dump(mode="json")
+    except (JournalError, CodecError, OSError) as error:
+        _log.warning("%s: no verdict: %s", directory.name, error)
+        return None
 
 
 def found_at(spec: LaboratorySettings) -> dict[str, str]:

@@ -78,7 +78,7 @@ function told(type, data) {
   if (away()) return;
   if (type === "QuestionAsked") announce("call", `A question: ${data.question.text}`);
   if (type === "Announced") announce("call", `In ${Math.round(data.seconds)} seconds: ${data.text}`);
-  if (type === "CampaignRests") announce("say", `${data.campaign}: ${data.state}`);
+  if (type === "CampaignRests") announce("say", `${data.campaign}: ${data.verdict?.text ?? data.state}`);
   if (type === "LogLine" && data.level === "error") alarm(data.text);
   if (type === "ChartViolated") { announce("say", data.text); charted = 0; }
   if (type === "PourProgressed") { soon(700); return; }

@@ -195,7 +195,7 @@ export function poursTable(pours) {
       cell("Spilled", pour.spilled_g === null ? "—" : `${pour.spilled_g.toFixed(1)} g`)))));
 }
 
-const CUPS = { waiting: "empty", filling: "being filled", full: "done", rejected: "rejected", refused: "not poured", unknown: "UNKNOWN" };
+const CUPS = { waiting: "empty", filling: "being filled", full: "done", missed: "missed", rejected: "rejected", refused: "not poured", unknown: "UNKNOWN" };
 
 /** A place for the rack of mixtures from above and the same as a table; `fillRack` fills it, and it stays as it was scrolled and opened. */
 export function rackFigure({ name }) {
@@ -257,11 +257,21 @@ export function queueList(items, paused, acts) {
   ];
 }
 
+/** What a run reached; red unless that is all that was wanted. */
+const verdictText = (verdict, state) => !verdict ? stateText(state) :
+  el("span", { class: verdict.word === "complete" ? "verdict" : "verdict problem" },
+    verdict.text + (state === "stopped" ? ", stopped" : ""));
+
+/** The reasons why something was not reached, folded. */
+const unmetDetails = (verdict) => !verdict?.unmet.length ? null :
+  el("details", {}, el("summary", {}, "What was not reached"),
+    el("ul", {}, verdict.unmet.map((goal) => el("li", {}, el("b", {}, goal.of.join(", ")), `: ${goal.reason}`))));
+
 export function endedList(items, acts) {
   if (!items.length) return el("p", { class: "quiet" }, "None.");
   return el("ul", {}, items.map((item) => el("li", {},
-    el("span", {}, el("b", {}, item.name), " ", modeBadge(item.mode), ` ${stateText(item.state)}`,
-      item.reason ? `: ${item.reason}` : "", followers(item), item.ended ? `, ${clock(item.ended)}` : ""),
+    el("span", {}, el("b", {}, item.name), " ", modeBadge(item.mode), " ", verdictText(item.verdict, item.state),
+      item.reason ? `: ${item.reason}` : "", followers(item), item.ended ? `, ${clock(item.ended)}` : "", unmetDetails(item.verdict)),
     acts.resume && ["paused", "failed", "unknown", "stopped"].includes(item.state) ?
       button(`resume ${item.id}`, "Go on", () => acts.resume(item), "plain") : null,
     item.report ? button(`report ${item.id}`, "Save report", () => acts.report(item.id), "plain") : null)));
@@ -291,7 +301,7 @@ export function previousRuns(runs, acts) {
   const best = (run) => Object.entries(run.recommended).map(([into, found]) =>
     `${into} ${found.best_loss === null ? "—" : percent(found.best_loss)}`).join(", ") || "—";
   return el("ul", {}, runs.map((run) => el("li", {},
-    el("span", {}, el("b", {}, run.run), " ", modeBadge(run.mode), ` ${day(run.begun)}, ${stateText(run.state)}, ${run.pours} pours`,
+    el("span", {}, el("b", {}, run.run), " ", modeBadge(run.mode), ` ${day(run.begun)}, ${run.state === "finished" && run.verdict ? run.verdict : stateText(run.state)}, ${run.pours} pours`,
       ` of ${run.liquid.join(", ")}, best: ${best(run)}`,
       run.notes.map((note) => el("p", { class: "quiet" }, note))),
     !acts.note ? null : button(`note ${run.run}`, "Note", () => acts.note(run), "plain"),

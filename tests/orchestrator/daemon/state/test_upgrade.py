@@ -47,7 +47,7 @@ def test_the_queue_of_version_0_2_1_goes_on(tmp_path: Path) -> None:
             assert (await served.get("/materials"))["liquids"][0]["id"] == "water"
             await served.post("/queue/resume")
             ended = await served.until(second["id"], "finished")
-            assert ended["verdict"] == ended["summary"]["verdict"]["word"]
+            assert ended["verdict"]["word"] == ended["summary"]["verdict"]["word"]
 
     run(work())
     database = sqlite3.connect(state / "daemon.sqlite")
