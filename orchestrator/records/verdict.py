@@ -250,8 +250,12 @@ def _unmet_stages(record: RunState) -> Iterator[UnmetGoal]:
         result = from_json(event.encoded)
         reason = None
         match result.get("kind"):
-            case "deployment":
-                reason = result.get("gave_up") or (None if result.get("recommended") else "no action is recommended")
+            case "deployment" if result.get("gave_up"):
+                reason = result["gave_up"]
+            case "deployment" if result.get("pours") and all(p["status"] != "weighed" for p in result["pours"]):
+                reason = "no pour was weighed"
+            case "deployment" if result.get("recommended") is None:
+                reason = "no action is recommended"
             case "calibration" if result.get("found") is None:
                 reason = "no θ* was found"
             case "confirmation" if result.get("pours") and all(pour.get("failed") for pour in result["pours"]):
@@ -265,4 +269,4 @@ def _unmet_stages(record: RunState) -> Iterator[UnmetGoal]:
 def _any_result(record: RunState) -> bool:
     """Whether a stage has found something without a pour: θ*, or an action."""
     results = (from_json(event.encoded) for event in record.closed.values())
-    return any(result.get("recommended") or result.get("found") for result in results)
+    return any(result.get("found") or (result.get("recommended") and not result.get("pours")) for result in results)
