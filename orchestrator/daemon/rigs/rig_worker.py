@@ -36,7 +36,7 @@ from orchestrator.live_view.rerun_subscriber import RerunMonitor, recorder_of
 from orchestrator.records.events import CampaignStateChanged, Event, LogLine, RequestFinished
 from orchestrator.records.journal_file import MB, JournalError, free_space
 from orchestrator.records.run_clock import run_time
-from orchestrator.records.run_record import CampaignResult, read_record
+from orchestrator.records.run_record import CampaignResult
 from orchestrator.records.run_registry import make_state_directory
 from orchestrator.records.states import State
 from orchestrator.records.verdict import outcome_of
