@@ -59,6 +59,12 @@ class ChartPoint(BaseModel):
     value: float
     """Their mean, in the unit of the chart; the geometric one for scatter and time."""
 
+    values: list[float] = []
+    """The single values of the day, in the unit of the chart: one that is far off may vanish in the mean."""
+
+    value_deviations: list[float] = []
+    """The same on the scale of `deviations`; empty while there are fewer than five days."""
+
     deviations: float | None = None
     """Distance from the history's mean in standard deviations; null while there are fewer than five days."""
 
@@ -132,6 +138,7 @@ def control_chart(
         z = _normal((point.value - mean) / max(deviation, 1e-300), len(history) - 1)
         half = _student(LIMIT, len(history) - 1) * deviation
         point.deviations, point.low, point.high = z, mean - half, mean + half
+        point.value_deviations = [z + LIMIT * (value - point.value) / max(half, 1e-300) for value in point.values]
         recent.append(z)
         before = tuple(sums)
         for side, sign in enumerate((1, -1)):
@@ -188,7 +195,7 @@ def _days(times: Sequence[float], values: Sequence[float], about: Sequence[str])
     for _, places in sorted(days.items()):
         of_day = [values[place] for place in places]
         mean = math.fsum(of_day) / len(of_day)
-        point = ChartPoint(time=times[places[0]], about=about[places[0]], pours=len(of_day), value=mean)
+        point = ChartPoint(time=times[places[0]], about=about[places[0]], pours=len(of_day), value=mean, values=of_day)
         yield point, math.fsum((value - mean) ** 2 for value in of_day)
 
 
@@ -352,6 +359,7 @@ def _chart(laboratory: str, mode: str, quantity: ChartedQuantity, rows: Sequence
     points, violations = control_chart(times, values, groups, resolution=quantity.resolution)
     for point in points if quantity.logarithmic else ():
         point.value = math.exp(point.value)
+        point.values = [math.exp(value) for value in point.values]
         if point.low is not None and point.high is not None:
             point.low, point.high = math.exp(point.low), math.exp(point.high)
     return LaboratoryChart(

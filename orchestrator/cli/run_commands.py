@@ -176,9 +176,7 @@ def pours(asked: PoursAsked, state: State = None, as_json: Json = False) -> None
 def chart_command(
     asked: ChartsAsked,  # type: ignore[valid-type]
     laboratory: Annotated[str | None, typer.Argument(help="Name of a laboratory, if there are several.")] = None,
-    png: Annotated[
-        Path | None, typer.Option(help="File of the picture; default: charts-LABORATORY-MODE.png in this folder.")
-    ] = None,
+    png: Annotated[Path | None, typer.Option(help="Also draw the charts of one laboratory to this file.")] = None,
     state: State = None,
 ) -> None:
     """Chart what every run measures, day by day, against limits from the laboratory's own history.
@@ -189,7 +187,7 @@ def chart_command(
     """
     from orchestrator.reports.console_view import print_table
     from orchestrator.reports.control_chart_figure import draw_charts
-    from orchestrator.reports.figure_style import safe_name, save
+    from orchestrator.reports.figure_style import save
 
     check_output(png, "--png", ".png")
     with _catalogue() as catalogue, _refusing():
@@ -208,8 +206,8 @@ def chart_command(
         print_note("no weighed pour that this holds for")
     for name, mode in benches:
         shown = [chart for chart in charts if (chart.laboratory, chart.mode) == (name, mode)]
-        path = Path(f"charts-{safe_name(name)}-{_mode(mode).lower()}.png") if png is None else png
-        print_note(f"picture: {save(draw_charts(shown), path)}")
+        if png is not None:
+            print_note(f"picture: {save(draw_charts(shown), png)}")
         print_table([_chart_row(chart) for chart in shown], title=f"{name}  {_mode(mode)}", right=("days", "last"))
         for chart in shown:
             if chart.text:

@@ -6,10 +6,12 @@ No call reaches a device, except the commands that stop motion.
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import json
 import logging
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +73,7 @@ def create_app() -> FastAPI:
         response_model=HealthOut,
         responses={503: {"model": HealthOut, "description": "Not ready; the problems give the reasons."}},
     )
+    app.add_api_route(f"{V1}/openapi.json", _description, include_in_schema=False)
     app.include_router(page_router())
     for kind in (StoreError, OSError):
         app.add_exception_handler(kind, _not_stored)
@@ -121,6 +124,16 @@ def openapi_text() -> str:
 def write_openapi(path: Path) -> None:
     """Write the OpenAPI description to a file."""
     path.write_text(openapi_text(), encoding="utf-8")
+
+
+@cache
+def _description_text() -> str:
+    return openapi_text()
+
+
+async def _description() -> Response:
+    """Return the API's OpenAPI description, from which programs generate clients. Needs no token."""
+    return Response(await asyncio.to_thread(_description_text), media_type="application/json")
 
 
 async def _health(daemon: Daemon) -> HealthOut:

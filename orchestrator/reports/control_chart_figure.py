@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from datetime import datetime, timedelta
 from typing import TYPE_CHECKING
 
-from orchestrator.catalogue.control_charts import LIMIT, LaboratoryChart
+from orchestrator.catalogue.control_charts import FEWEST, LIMIT, LaboratoryChart
 from orchestrator.reports import figure_style as style
 
 if TYPE_CHECKING:
@@ -20,9 +20,10 @@ MARGIN = timedelta(days=2)
 
 
 def draw_charts(charts: Sequence[LaboratoryChart]) -> Figure:
-    """Daily means with their limits. Points of a violation are red, from its estimated begin.
+    """Daily means with their limits, and the single values of each day. Points of a violation are red, from its begin.
 
-    Quantities whose levels depend on vessel or liquid are shown as deviations if there are several of them.
+    A panel without points says why. Quantities whose levels depend on vessel or liquid are shown as deviations if
+    there are several of them.
 
     Args:
         charts: of one laboratory, at least one.
@@ -44,8 +45,24 @@ def _panel(axes: Axes, chart: LaboratoryChart) -> None:
 
     several = len({point.about for point in chart.points}) > 1
     points = [point for point in chart.points if not several or point.deviations is not None]
+    if not points:
+        style.dress(axes, title=chart.label, y="")
+        text = f"no limits yet: fewer than {FEWEST} days\nof each vessel and liquid"
+        axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes, color=style.GREY)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        return
     times = [datetime.fromtimestamp(point.time) for point in points]
     values = [(point.deviations or 0.0) if several else point.value for point in points]
+    singles = [
+        (when, value)
+        for when, point in zip(times, points, strict=True)
+        if point.pours > 1
+        for value in (point.value_deviations if several else point.values)
+    ]
+    if singles:
+        days, heights = zip(*singles, strict=True)
+        axes.scatter(days, heights, s=5, c=style.GREY, linewidths=0.0, zorder=2)
     limits = [
         (when, -LIMIT, LIMIT) if several else (when, point.low, point.high)
         for when, point in zip(times, points, strict=True)
@@ -54,8 +71,10 @@ def _panel(axes: Axes, chart: LaboratoryChart) -> None:
     if limits:
         since, low, high = zip(*limits, strict=True)
         axes.fill_between(since, low, high, color=style.PALE, alpha=0.6, step="mid", zorder=1)
-        bottom, top = min(low[-1], *values), max(high[-1], *values)  # the first limits are wide
-        axes.set_ylim(bottom - 0.1 * (top - bottom), top + 0.1 * (top - bottom))
+        every = [*values, *(value for _, value in singles)]
+        bottom, top = min(low[-1], *every), max(high[-1], *every)  # the first limits are wide
+        if top > bottom:
+            axes.set_ylim(bottom - 0.1 * (top - bottom), top + 0.1 * (top - bottom))
     out = [
         any(v.begun <= point.time and (v.ended is None or point.time < v.ended) for v in chart.violations)
         for point in points
@@ -70,8 +89,7 @@ def _panel(axes: Axes, chart: LaboratoryChart) -> None:
     style.dress(axes, title=title, y=f"[{unit}]")
     if lasting is not None:
         axes.set_title(title, fontsize=11, loc="left", color=style.BEST, pad=8)
-    if times:  # at least some days, however few were charted
-        axes.set_xlim(times[0] - MARGIN, times[-1] + MARGIN)  # type: ignore[arg-type]
+    axes.set_xlim(times[0] - MARGIN, times[-1] + MARGIN)  # type: ignore[arg-type]
     locator = AutoDateLocator(maxticks=6)  # type: ignore[no-untyped-call]
     axes.xaxis.set_major_locator(locator)
     axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]

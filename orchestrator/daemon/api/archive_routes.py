@@ -20,6 +20,7 @@ from orchestrator.catalogue.catalogue import Catalogue, NoSuchRunError
 from orchestrator.catalogue.control_charts import LaboratoryChart
 from orchestrator.catalogue.run_reading import PreviousRun
 from orchestrator.daemon.api.access_control import Daemon, Operator, Viewer
+from orchestrator.daemon.api.schemas import text_response
 from orchestrator.daemon.rigs.pour_request import RequestModel
 from orchestrator.daemon.rigs.rig_worker import SharedServices
 from orchestrator.daemon.state.run_readout import REPORT
@@ -88,7 +89,7 @@ async def charts(daemon: Daemon, person: Viewer) -> list[LaboratoryChart]:
     "/runs/{run}/report",
     operation_id="run_report",
     response_class=FileResponse,
-    responses={200: {"content": {"text/html": {}}, "description": "A self-contained HTML page."}},
+    responses={200: text_response("text/html", "A self-contained HTML page.")},
 )
 async def run_report(daemon: Daemon, person: Viewer, run: str) -> FileResponse:
     """Return the report of a run."""

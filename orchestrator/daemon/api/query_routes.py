@@ -23,7 +23,7 @@ from pydantic import Field
 
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.api.access_control import Daemon, Queue, Stops, Viewer
-from orchestrator.daemon.api.schemas import CampaignDetailOut, CampaignOut, RigOut, StatusOut
+from orchestrator.daemon.api.schemas import CampaignDetailOut, CampaignOut, RigOut, StatusOut, text_response
 from orchestrator.daemon.rigs.campaign_queue import CampaignQueue
 from orchestrator.daemon.rigs.emergency_stop import EmergencyStops
 from orchestrator.daemon.rigs.rig_worker import SharedServices
@@ -133,7 +133,7 @@ async def campaign(daemon: Daemon, queue: Queue, person: Viewer, key: str) -> Ca
     "/campaigns/{key}/report",
     operation_id="report",
     response_class=FileResponse,
-    responses={200: {"content": {"text/html": {}}, "description": "A self-contained HTML page."}},
+    responses={200: text_response("text/html", "A self-contained HTML page.")},
 )
 async def report(daemon: Daemon, queue: Queue, person: Viewer, key: str) -> FileResponse:
     """Return the report of a campaign's run."""
@@ -160,7 +160,7 @@ async def questions(
     operation_id="events",
     response_class=StreamingResponse,
     responses={
-        200: {"content": {"text/event-stream": {}}, "description": "Server-sent events: id, event, data (JSON)."},
+        200: text_response("text/event-stream", "Server-sent events: id, event, data (JSON)."),
         503: {"description": "Too many readers."},
     },
 )
@@ -199,7 +199,7 @@ async def events(
     "/metrics",
     operation_id="metrics",
     response_class=Response,
-    responses={200: {"content": {"text/plain": {}}, "description": "Prometheus' text format."}},
+    responses={200: text_response("text/plain", "Prometheus' text format.")},
 )
 async def metrics(daemon: Daemon, stops: Stops, person: Viewer) -> Response:
     """Return the metrics in Prometheus' text format."""

@@ -15,6 +15,11 @@ from orchestrator.records.verdict import Verdict
 from orchestrator.reports.run_summary import PourSummary
 
 
+def text_response(media_type: str, description: str) -> dict[str, Any]:
+    """Description of a response that is text of another media type than JSON."""
+    return {"content": {media_type: {"schema": {"type": "string"}}}, "description": description}
+
+
 class ResponseModel(BaseModel):
     """Base of the models of responses."""
 

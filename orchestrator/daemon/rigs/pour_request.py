@@ -19,6 +19,7 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    WithJsonSchema,
     model_validator,
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -77,8 +78,14 @@ YEAR = 366.0 * 86400.0
 Moment = Annotated[
     float,
     BeforeValidator(moment),
-    Field(allow_inf_nan=False, description="Seconds since 1970, or a time with its zone: 2026-11-27T08:00:00+01:00."),
+    Field(allow_inf_nan=False),
     AfterValidator(_near),
+    WithJsonSchema(
+        {
+            "anyOf": [{"type": "number"}, {"type": "string", "format": "date-time"}],
+            "description": "Seconds since 1970, or a time with its zone: 2026-11-27T08:00:00+01:00.",
+        }
+    ),
 ]
 
 

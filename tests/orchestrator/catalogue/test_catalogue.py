@@ -278,7 +278,9 @@ def test_the_command_draws_charts_of_a_laboratory_and_a_note_begins_new_limits(
     assert sum(point.pours for point in chart.points) == 4
     assert "time of a pour [s]" in table
     assert "too few days" in table
-    assert (tmp_path / "charts-toy-virtual.png").stat().st_size > 5_000
+    assert not list(tmp_path.glob("*.png"))  # nothing is written unless it is asked for
+    assert invoke("runs chart --png toy.png").exit_code == 0
+    assert (tmp_path / "toy.png").stat().st_size > 5_000
     refused = invoke("runs chart elsewhere")
     assert refused.exit_code == 2
     assert "elsewhere: no weighed pour of this laboratory; known: toy" in refused.stderr

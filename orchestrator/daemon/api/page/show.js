@@ -286,10 +286,13 @@ export function chartFigure(chart) {
     return drawn;
   };
   const out = ({ time }) => chart.violations.some(({ begun, ended }) => begun <= time && (ended === null || time < ended));
+  const height = (deviations) => 30 - 3.75 * Math.max(-7, Math.min(7, deviations));
   const begin = days[0]?.time, span = Math.max(last.time - begin, 86400);
   const picture = draw("svg", { viewBox: "0 0 240 60", role: "img", "aria-label": chart.text || `${chart.label}: in control` });
-  picture.append(draw("rect", { class: "limits", x: 0, y: 15, width: 240, height: 30 }), ...days.map((point) => draw("circle", {
-    class: out(point) ? "out" : "", r: 2, cx: 5 + 230 * (point.time - begin) / span, cy: 30 - 3.75 * Math.max(-7, Math.min(7, point.deviations)),
+  picture.append(draw("rect", { class: "limits", x: 0, y: 15, width: 240, height: 30 }), ...days.filter((point) => point.pours > 1).flatMap((point) => point.value_deviations.map((value) => draw("circle", {
+    class: "single", r: 1, cx: 5 + 230 * (point.time - begin) / span, cy: height(value),
+  }))), ...days.map((point) => draw("circle", {
+    class: out(point) ? "out" : "", r: 2, cx: 5 + 230 * (point.time - begin) / span, cy: height(point.deviations),
   })));
   return el("figure", {}, picture, el("figcaption", {}, el("b", {}, chart.label), ` ${+last.value.toPrecision(4)} ${chart.unit}, ${chart.laboratory} `,
     modeBadge(chart.mode), chart.text ? el("p", { class: "problem" }, sentence(chart.text)) : null));
