@@ -25,8 +25,6 @@ from pathlib import Path
 
 from machine import ROOT, say, started
 
-from actors.runtime.child_process import last_lines
-
 COMMANDS = {
     "quickstart": ["campaigns/quickstart.yaml"],
     "night": ["campaigns/mixtures.yaml", "--laboratory", "laboratories/rack.yaml"],
@@ -50,7 +48,7 @@ def busy_processes(count: int) -> Iterator[None]:
 
 
 def run_once(name: str, seed: int, folder: Path) -> tuple[int, float, str]:
-    """Run one campaign. Returns its exit code, its time [s] and the end of its messages."""
+    """Run one campaign. Returns its exit code, its time [s] and its messages."""
     shutil.copytree(ROOT / "configs", folder / "configs")
     words = [str(folder / "configs" / word) if word.endswith(".yaml") else word for word in COMMANDS[name]]
     command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "run", *words]
@@ -62,7 +60,7 @@ def run_once(name: str, seed: int, folder: Path) -> tuple[int, float, str]:
         finally:
             child.terminate()
             child.wait()
-    return status, time.monotonic() - begin, last_lines(output.read_text(encoding="utf-8"))
+    return status, time.monotonic() - begin, output.read_text(encoding="utf-8").strip()
 
 
 def main() -> int:

@@ -263,7 +263,8 @@ class BenchProcedure(ABC):
         except LaboratoryError as error:
             self._begun = self._begun or (self._moves and setup.lost)
             text = f"{error}. {await self._unknown(error) if self._begun else 'Nothing was poured'}"
-            untouched = not self._begun or await setup.ground_truth.untouched()
+            # a dose with carrying has marked its cup as UNKNOWN, and only a person may enter its content
+            untouched = not self._begun or (setup.doses is None and await setup.ground_truth.untouched())
             await self._consent.leave_safe()
             if setup.mode == "virtual" and untouched and _is_lost_link(error):
                 raise LinkLostError(text) from error
