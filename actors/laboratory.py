@@ -41,7 +41,7 @@ from actors.runtime.remote_object import Device, LocalDevice, RayDevice
 from actors.simulators.job_runner import Simulator, give_back, pour_simulator
 from actors.simulators.local_worker import process_pool, thread_pool
 from actors.simulators.pool import PoolShare, WorkerPool
-from actors.simulators.ray_worker import ray_pool
+from actors.simulators.ray_worker import BESIDE_VIRTUAL, NICENESS, ray_pool
 from sim_engine.engine_package import engine_name
 from sim_engine.errors import EngineError
 from sim_engine.resources import EXTRAS, PACKAGES, cache_directory, installed
@@ -409,7 +409,8 @@ class RayLaboratory(_OpenLaboratory):
             # The ground truth's simulator, on the arm's machine. It reserves no core: the pool's size is the
             # campaign's choice, and a pour must never wait for it.
             placement = None if node is None else node.options
-            self._liquid = self._open_pool(ray_pool(1, self._make, cpus=0.0, placement=placement, tell=self._tell_loss))
+            liquid = ray_pool(1, self._make, cpus=0.0, placement=placement, niceness=0, tell=self._tell_loss)
+            self._liquid = self._open_pool(liquid)
         await self._open_bench(partial(RayDevice, node=node), self._liquid)
 
     def _tell_loss(self, text: str) -> None:
@@ -417,7 +418,8 @@ class RayLaboratory(_OpenLaboratory):
 
     def _ray_pool(self) -> WorkerPool:
         if self._cluster is None:
-            return ray_pool(self._spec.simulator_count, self._make, tell=self._tell_loss)
+            niceness = BESIDE_VIRTUAL if self._spec.mode == "virtual" else NICENESS
+            return ray_pool(self._spec.simulator_count, self._make, niceness=niceness, tell=self._tell_loss)
         pool = ray_pool(
             self._spec.simulators or self._cluster.cpus,
             self._make,

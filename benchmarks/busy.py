@@ -17,6 +17,7 @@ import argparse
 import contextlib
 import os
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -52,11 +53,14 @@ def run_once(name: str, seed: int, folder: Path) -> tuple[int, float, str]:
     shutil.copytree(ROOT / "configs", folder / "configs")
     words = [str(folder / "configs" / word) if word.endswith(".yaml") else word for word in COMMANDS[name]]
     command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "run", *words]
+    environment = {**os.environ, "DECANT_STATE": str(folder / "state")}  # an account of vessels of its own
     output, begin = folder / "output.txt", time.monotonic()
     with output.open("wb") as file:
-        child = started([*command, "--seed", str(seed), "--quiet"], stdout=file, stderr=file)
+        child = started([*command, "--seed", str(seed), "--quiet"], env=environment, stdout=file, stderr=file)
         try:
             status = child.wait(LONGEST)
+        except subprocess.TimeoutExpired:
+            status = 124
         finally:
             child.terminate()
             child.wait()

@@ -46,8 +46,10 @@ from sim_engine.scene import PourTask
 from sim_engine.vessel.mesh_shape import MeshShape
 from sim_engine.vessel.shapes import VesselSpec
 
-NICENESS = 15
-"""Priority of simulators, below the arm's driver, the optimiser and other programs [nice]."""
+NICENESS, BESIDE_VIRTUAL = 15, 5
+"""Priorities of simulators, below the arm's driver, the optimiser and other programs [nice]; the second one where no
+real arm moves, since at 15 they get next to nothing beside other busy programs.
+"""
 
 CONTROL, LIFE = "control", "life"
 """Concurrency groups of calls that do not queue behind a job: short ones, and one that lasts as long as the process."""
@@ -62,8 +64,8 @@ class SimulatorProcess:
     Ray's restarts are off: the pool replaces a dead worker and retries its job. Ray itself would lose queued calls and
     would not keep the order of those that it repeats."""
 
-    def __init__(self, make: Callable[[], Simulator]) -> None:
-        os.nice(NICENESS)
+    def __init__(self, make: Callable[[], Simulator], niceness: int = NICENESS) -> None:
+        os.nice(niceness)
         self._runner = JobRunner(make)
         self._recalled: set[int] = set()
 
@@ -115,13 +117,20 @@ class RayWorker:
         packer: shared by the workers of a pool.
         options: Ray's options that place the actor.
         expected: versions that it must have; None if they cannot differ.
+        niceness: of its process.
     """
 
     def __init__(
-        self, make: Callable[[], Simulator], packer: Packer, options: Mapping[str, Any], expected: Versions | None
+        self,
+        make: Callable[[], Simulator],
+        packer: Packer,
+        options: Mapping[str, Any],
+        expected: Versions | None,
+        niceness: int,
     ) -> None:
         self._packer, self._expected = packer, expected
-        self._actor = actor_class(SimulatorProcess, ((CONTROL, 1), (LIFE, 1))).options(**options).remote(make)
+        remote = actor_class(SimulatorProcess, ((CONTROL, 1), (LIFE, 1)))
+        self._actor = remote.options(**options).remote(make, niceness)
 
     async def start(self) -> Greeting:
         """See `Worker.start`."""
@@ -176,6 +185,7 @@ def ray_pool(
     cpus: float = 1.0,
     placement: Mapping[str, Any] | None = None,
     expected: Versions | None = None,
+    niceness: int = NICENESS,
     retries: int = RETRIES,
     deadline: float = DEADLINE,
     tell: Callable[[str], None] = lambda text: None,
@@ -188,10 +198,11 @@ def ray_pool(
         cpus: cores that Ray counts for a worker.
         placement: Ray's options that place the workers.
         expected: versions that workers must have; None if they cannot differ.
+        niceness: of the workers' processes.
         retries, deadline, tell: see `WorkerPool`.
     """
     options = {"num_cpus": cpus, **(placement or {})}
-    worker = partial(RayWorker, make, Packer(), options, expected)
+    worker = partial(RayWorker, make, Packer(), options, expected, niceness)
     return WorkerPool(size, worker, ahead=1, retries=retries, deadline=deadline, tell=tell)
 
 
