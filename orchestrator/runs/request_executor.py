@@ -14,11 +14,13 @@ import asyncio
 import inspect
 import os
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 
+from actors.arm.arm_settings import ArmSettings
+from actors.bench.pour_feasibility import path_of
 from actors.interfaces import (
     Answering,
     Bench,
@@ -49,6 +51,7 @@ from orchestrator.learning.requests import (
 )
 from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.resume import AskOperator
+from sim_engine.action import Action
 from sim_engine.outcome import RecordedFrames, SimulatedPour
 from sim_engine.scene import PourTask, Scene
 
@@ -264,6 +267,9 @@ class RequestExecutor:
         frame_rate: of recorded simulations [1/s].
         ask_operator: answers questions of strategies.
         repeats: a virtual bench repeats pours whose outcome is unknown.
+        arm: of the laboratory.
+        made_by_arm: names of the scenes whose actions this arm will make. A simulation of an action that it can't make
+            is an invalid action, as one in which the vessels touch: a search stays within the arm's limits.
     """
 
     def __init__(
@@ -275,9 +281,12 @@ class RequestExecutor:
         ask_operator: AskOperator | None = None,
         *,
         repeats: bool = False,
+        arm: ArmSettings | None = None,
+        made_by_arm: Collection[str] = (),
     ) -> None:
         self._laboratory, self._ask_operator = laboratory, ask_operator
-        self._repeats = repeats
+        self._repeats, self._arm, self._made_by_arm = repeats, arm, made_by_arm
+        self._refusals: dict[tuple[str, Action], asyncio.Future[str]] = {}
         self._scenes = scenes
         self.deadlines = deadlines
         self._frame_rate = frame_rate
@@ -332,8 +341,11 @@ class RequestExecutor:
             return await self._laboratory.simulators.simulate(task)
 
     async def _simulated(self, request: Simulate, *, record: bool = False) -> tuple[Outcome, RecordedFrames | None]:
+        refusal = self._refusal(request)
         try:
             result = await self._pooled(request, self._frame_rate if record else 0.0)
+            if refusal is not None and (reason := await asyncio.shield(refusal)):
+                return Failed("invalid_action", reason), None
         except InvalidActionError as error:
             return Failed("invalid_action", str(error)), None
         except SimulationError as error:
@@ -344,6 +356,17 @@ class RequestExecutor:
         if result.outcome.invalid is not None:
             return Failed("simulation", result.outcome.invalid), result.frames
         return Simulated(result.outcome), result.frames
+
+    def _refusal(self, request: Simulate) -> asyncio.Future[str] | None:
+        """Why the arm can't make the action as planned, once that is worked out next to the simulation; '' if it can.
+        None: it will not be asked to."""
+        if self._arm is None or request.scene not in self._made_by_arm or request.pose_error is not None:
+            return None
+        key = request.scene, request.action
+        if key not in self._refusals:
+            check = asyncio.to_thread(_refusal, self._scene(request.scene), request.action, self._arm)
+            self._refusals[key] = asyncio.ensure_future(check)
+        return self._refusals[key]
 
     async def pour(
         self,
@@ -487,6 +510,14 @@ class RequestExecutor:
         except KeyError:
             known = ", ".join(sorted(self._scenes)) or "none"
             raise RequestExecutorError(f"a request names the scene '{name}', but the plan has {known}") from None
+
+
+def _refusal(scene: Scene, action: Action, arm: ArmSettings) -> str:
+    try:
+        path_of(scene, action, arm)
+    except InvalidActionError as error:
+        return str(error)
+    return ""
 
 
 _ORDINAL = {1: "second", 2: "third"}

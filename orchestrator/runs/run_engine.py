@@ -173,6 +173,7 @@ class _RunEngine:
             if isinstance(laboratory, Telling):
                 laboratory.listen(self._on_notice)
             self._check_bench(laboratory, histories)
+            deployment = self._plan.deployment
             executor = RequestExecutor(
                 laboratory,
                 self._scenes,
@@ -180,6 +181,8 @@ class _RunEngine:
                 FRAME_RATE,
                 self._ask_operator,
                 repeats=self._plan.on_unknown == "repeat",
+                arm=self._plan.laboratory.arm,
+                made_by_arm=() if deployment is None else {scene.name for scene in deployment.scenes},
             )
             executor.speculation.changed = lambda running, waiting: self._journal.append(
                 SpeculationProgressed(running=running, waiting=waiting)
