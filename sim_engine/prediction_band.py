@@ -15,6 +15,7 @@ In other scenes the larger of the residual and the error of coarse particles is 
 
     in a scene of the calibration:  width² = max(residual² − s², 0) + 2 s² / n
     in another scene:               width² = max(resolution, residual, finer)² + 2 s² / n
+    without a calibration:          width² = max(resolution, uncalibrated, finer)² + 2 s² / n
 
 `finer` is the shift of a simulation with many more particles, if there is one; it moves the interval, too. The
 width is that of the normal distribution about each simulation; their mixture is the distribution of the pour. A band
@@ -48,6 +49,11 @@ about the root mean square of Φ⁻¹(r) − Φ⁻¹(fine) over those of the nin
 that spill more than one in a thousand (fifteen), with the spillage of 10,000 particles as `fine`. Among pours that have
 converged it is half of it; splashes, which do not converge, differ more. With 500 particles it was 0.32: the error
 decreases with the spacing, as N^(−1/3)."""
+
+UNCALIBRATED = 0.97
+"""Shift of a pour from an uncalibrated simulator (standard deviation): root mean square of 80 pours into four
+receivers on the ten benches of configs/studies/benches.yaml, which were drawn before they were used
+(`benchmarks/uncalibrated.py`). A bench with larger errors of placement deviates more."""
 
 _NORMAL = NormalDist()
 _WIDEST = 8.0
@@ -175,6 +181,7 @@ def band(
     residual: CalibrationResidual | None = None,
     level: float = LEVEL,
     finer: float = 0.0,
+    least: float = 0.0,
 ) -> PredictionInterval:
     """The interval of a single pour, given its simulations.
 
@@ -187,6 +194,7 @@ def band(
         level: probability with which a pour lies in it.
         finer: shift of a simulation with many more particles; it moves the interval, and is the least
             standard deviation of what still finer ones would add. 0 without one.
+        least: standard deviation of the shift that the pour has at least, beyond the scatter of its simulations.
 
     Raises:
         ValueError: no simulation, or a level that is not between 0 and 1.
@@ -198,7 +206,7 @@ def band(
     mean = math.fsum(places) / count
     spread = math.fsum((z - mean) ** 2 for z in places) / (count - 1) if count > 1 else 0.0
     here = residual is not None and residual.here
-    lacking = max(lacking_shift(particles, residual, math.sqrt(spread)), abs(finer))
+    lacking = max(lacking_shift(particles, residual, math.sqrt(spread)), abs(finer), least)
     # The mixture of the simulations has a variance of s² (n − 1) / n; a further one differs from their mean by
     # s² (n + 1) / n.
     width = max(math.sqrt(lacking**2 + 2.0 * spread / count), _NARROWEST)
@@ -217,7 +225,8 @@ def band(
 def band_of(
     outcomes: Sequence[PourOutcome], residual: CalibrationResidual | None = None, finer: float = 0.0
 ) -> PredictionInterval | None:
-    """The band of one pour's simulations; None if none of them has a spillage.
+    """The band of one pour's simulations; None if none of them has a spillage. Without a calibration it has the width
+    that an uncalibrated simulator needs.
 
     Args:
         outcomes: of the same action, with fresh seeds, perhaps of several θ and shapes.
@@ -225,7 +234,10 @@ def band_of(
     """
     usable = [outcome for outcome in outcomes if outcome.invalid is None]
     spillages = [r for outcome in usable if (r := outcome.fractions.spillage) is not None]
-    return band(spillages, usable[0].particles, residual, finer=finer) if spillages else None
+    if not spillages:
+        return None
+    least = UNCALIBRATED if residual is None else 0.0
+    return band(spillages, usable[0].particles, residual, finer=finer, least=least)
 
 
 def _quantile(places: Sequence[float], width: float, share: float) -> float:

@@ -285,5 +285,7 @@ class PredictionInputs:
             parts.insert(1, "shapes that the vessels may have")
         if self.residual is not None:
             parts.append("the residual of calibration")
-            return f"intervals from {', '.join(parts[:-1])} and {parts[-1]}"
-        return f"intervals from {', '.join(parts[:-1])} and {parts[-1]} alone (the residual of calibration is unknown)"
+        else:
+            parts.append("the errors of an uncalibrated simulator on ten benches")
+        text = f"intervals from {', '.join(parts[:-1])} and {parts[-1]}"
+        return text if self.residual is not None else f"uncalibrated: {text}"

@@ -154,12 +154,16 @@ def amount_text(grams: float | None, millilitres: float | None) -> str:
 
 
 def band_line(band: PredictionInterval) -> str:
-    """'nine single pours in ten spill 0.8 … 5.7 % of what is poured (simulations ± 0.3, …)'."""
+    """'nine single pours in ten spill 0.8 … 5.7 % of what is poured (simulations ± 0.3, …)'; 'uncalibrated: …'."""
     causes = {"simulations": band.simulations, "residual of calibration": band.discrepancy}
     causes["resolution"] = band.resolution or None
     listed = ", ".join(f"{name} ± {100 * value:.2f}" for name, value in causes.items() if value is not None)
-    lacking = "" if band.discrepancy is not None else "; the residual of calibration is unknown"
-    return f"nine single pours in ten spill {band.percent(2)} of what is poured ({listed}{lacking})"
+    if band.discrepancy is not None:
+        return f"nine single pours in ten spill {band.percent(2)} of what is poured ({listed})"
+    return (
+        f"uncalibrated: nine single pours in ten spill {band.percent(0)} of what is poured, if this bench deviates "
+        f"from the simulator as ten benches that were drawn at random ({listed})"
+    )
 
 
 def pool_line(busy: float | None, longest_wait: float | None) -> str:

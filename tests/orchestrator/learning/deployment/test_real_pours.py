@@ -157,20 +157,20 @@ def test_a_plan_ends_with_fresh_simulations_of_what_it_recommends(tmp_path: Path
     band = summary.outcome.receivers["cup"].prediction_interval
     assert band is not None
     assert band.low < found["spillage"].mean < band.high
-    assert f"Nine single pours in ten spill {band.percent(2)} of what is poured" in text
-    assert "the residual of calibration is unknown" in text
+    assert f"Uncalibrated: nine single pours in ten spill {band.percent(0)} of what is poured" in text
 
 
-def test_what_calibration_left_over_widens_the_band_of_a_planned_pour() -> None:
+def test_a_planned_pour_has_the_band_of_an_uncalibrated_simulator_or_of_what_calibration_left_over() -> None:
     bands = []
-    for residual in (None, CalibrationResidual(0.6)):
+    for residual in (CalibrationResidual(0.4), CalibrationResidual(0.6), None):
         strategy = RepeatedSimulation(Costing(Loss(), SCENE, THETA), ACTION, 5, 3, residual=residual)
         StrategyHarness(narrow_cup).run(strategy)
         found = strategy.result().interval
         assert found is not None
         bands.append(found)
-    assert bands[1].low < bands[0].low < bands[0].high < bands[1].high
-    assert bands[0].discrepancy is None
+    few, more, uncalibrated = bands
+    assert uncalibrated.low < more.low < few.low < few.high < more.high < uncalibrated.high
+    assert uncalibrated.discrepancy is None
 
 
 def test_the_band_of_a_mirrored_pour_contains_what_finer_particles_spill() -> None:
@@ -180,10 +180,11 @@ def test_the_band_of_a_mirrored_pour_contains_what_finer_particles_spill() -> No
         return (0.21 if parameters.particles == 20_000 else 0.05) + 0.003 * rng.standard_normal()
 
     bands = {}
-    here = CalibrationResidual(0.1, here=True)  # its pours were weighed in this scene: it contains the resolution
+    elsewhere = CalibrationResidual(0.1)
+    here = replace(elsewhere, here=True)  # its pours were weighed in this scene: it contains the resolution
     for scene, residual in (
-        (SCENE, None),
-        (replace(SCENE, mirrored=True), None),
+        (SCENE, elsewhere),
+        (replace(SCENE, mirrored=True), elsewhere),
         (replace(SCENE, mirrored=True), here),
     ):
         theta = THETA.model_copy(update={"particles": 2_000})
@@ -192,7 +193,7 @@ def test_the_band_of_a_mirrored_pour_contains_what_finer_particles_spill() -> No
         found = strategy.result()
         bands[len(played.simulations), residual] = found.interval
         assert found.over_seeds["spillage"].mean == pytest.approx(0.05, abs=0.01)  # of the usual particles alone
-    whole, mirrored, weighed = bands[5, None], bands[6, None], bands[5, here]
+    whole, mirrored, weighed = bands[5, elsewhere], bands[6, elsewhere], bands[5, here]
     assert whole is not None
     assert mirrored is not None
     assert weighed is not None
