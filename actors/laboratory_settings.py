@@ -229,6 +229,11 @@ class LaboratorySettings(Settings):
             operator=self.operator.with_values(answers=self.operator.answers or answers),
         )
 
+    @property
+    def expected_arm(self) -> ArmSettings | None:
+        """The arm with the geometry that a run will use: for checks before it is connected."""
+        return None if self.arm is None else self.arm.expected(virtual=self.mode == "virtual")
+
     def in_real_time(self) -> Self:
         """The laboratory for wanted amounts: an arm over its wires that carries nothing then moves in real time.
 
@@ -297,8 +302,8 @@ class LaboratorySettings(Settings):
             problems.add("with places the balance stands under the receiver and is connected: 'placement: receiver'",
                 "balance")  # fmt: skip
         check_places(problems, self.places, getattr(self.arm, "tool", None))
-        arm = self.arm.in_laboratory(self.cell, 1.0)
         if problems.valid("places", "arm", "cell"):
+            arm = self.arm.in_laboratory(self.cell, 1.0).expected(virtual=self.mode == "virtual")
             owners = [number for number, place in enumerate(self.places) for _ in place.each]
             for number, text in arm_kind(arm).place_problems(all_places(self.places), {}):
                 problems.add(text, "places", owners[number], more=True)

@@ -49,6 +49,12 @@ RESIDUAL = 3e-3
 LEVEL = math.radians(2.0)
 """Largest slope of a rack."""
 
+TURNED = math.radians(10.0)
+"""Largest angle of the tool at a taught corner of a rack from the tool at A1, whose orientation all positions have."""
+
+BESIDE = math.radians(20.0)
+"""Angle from the direction in which the tool reaches below which two vessels stand beside each other."""
+
 
 class RackSettings(Settings):
     """Rows A, B … and columns 1, 2 … of a rack, seen from above with A1 at the top left."""
@@ -84,6 +90,12 @@ class RackSettings(Settings):
         if self.columns > 1:
             last[position_name(0, self.columns - 1)] = (0, self.columns - 1)
         return {"A1": (0, 0), **last}
+
+    @property
+    def taught_corners(self) -> list[Pose | None]:
+        """Poses of the `corners` after A1; None where it is still to be taught."""
+        last_row = [self.last_row] if self.rows > 1 else []
+        return last_row + ([self.last_column] if self.columns > 1 else [])
 
     def positions(self, first: Pose) -> tuple[dict[str, Pose], float]:
         """The poses of all positions by name, and the residual of the taught ones.
@@ -323,8 +335,16 @@ def _check_rack(problems: Problems, place: PlaceSettings, number: int) -> None:
 
 
 def rack_problem(place: PlaceSettings) -> str:
-    """Why the taught positions of a rack do not fit its pitch; '' if they do."""
+    """Why the taught positions of a rack do not fit its pitch or each other; '' if they do."""
     assert place.rack is not None
+    rack, corners = place.rack, [*place.rack.corners][1:]
+    for name, pose in zip(corners, rack.taught_corners, strict=True):
+        if pose is not None and (turned := _angle_between(pose, place.pose)) > TURNED:
+            return (
+                f"at {name} of '{place.name}' the tool was turned by {math.degrees(turned):.0f} deg from where it was "
+                f"at A1, and {math.degrees(TURNED):.0f} deg are allowed: all positions are reached as A1 is. Teach "
+                f"{name} again with the tool as at A1"
+            )
     _, residual = place.rack.positions(place.pose)
     if residual > RESIDUAL:
         return (
@@ -338,13 +358,51 @@ def rack_problem(place: PlaceSettings) -> str:
     return ""
 
 
+def rows_behind_others(place: PlaceSettings) -> str:
+    """Which vessels of a flat rack the tool reaches only over others, for the person who teaches it; '' if none.
+
+    A tool that reaches from the side passes over the rows, or columns, that stand before the one it reaches for.
+    """
+    rack = place.rack
+    w, x, y, z = _quaternion(place.pose)
+    reach = complex(2.0 * (x * z + w * y), 2.0 * (y * z - w * x))  # the tool's z axis, seen from above
+    if rack is None or abs(reach) < math.sin(BESIDE):
+        return ""
+    poses, _ = rack.positions(place.pose)
+    names = ([chr(ord("A") + row) for row in range(rack.rows)], [str(1 + column) for column in range(rack.columns)])
+    texts = []
+    for kind, every, step in (("row", names[0], (1, 0)), ("column", names[1], (0, 1))):
+        if len(every) < 2 or (kind == "row" and rack.row_rise):
+            continue
+        first, second = (complex(*poses[position_name(*at)].as_list[:2]) for at in ((0, 0), step))
+        along = ((second - first) * reach.conjugate()).real / (abs(second - first) * abs(reach))
+        if abs(along) > math.sin(BESIDE):
+            before, *behind = every if along > 0.0 else every[::-1]
+            texts.append(
+                f"the {kind}s of '{place.name}' stand at one height, and the tool reaches from the side: with vessels "
+                f"everywhere only {kind} {before} can be used, since the tool would pass through the vessels before "
+                f"{', '.join(behind)}. Put vessels into one {kind} at a time"
+                + (
+                    ", or let the rows rise as on stairs, each by a vessel's height (row_rise)"
+                    if kind == "row"
+                    else ", or turn the rack so that the tool reaches along its rows, with 'row_rise'"
+                )
+            )
+    return "; ".join(texts)
+
+
 def _differ(first_pose: Pose, other: Pose) -> bool:
     """Whether two poses differ by more than 0.1 mm or 0.1 mrad. Near half a turn, a controller shows either of two
     opposite rotation vectors for the same pose."""
     apart = math.dist(first_pose.as_list[:3], other.as_list[:3])
-    first, second = (_quaternion(pose) for pose in (first_pose, other))
-    turned = min(math.dist(first, second), math.dist(first, tuple(-component for component in second)))
-    return apart > 1e-4 or 2.0 * turned > 1e-4
+    return apart > 1e-4 or _angle_between(first_pose, other) > 1e-4
+
+
+def _angle_between(pose: Pose, other: Pose) -> float:
+    """Angle of the rotation from one orientation to another [rad], 0 … π."""
+    first, second = (_quaternion(each) for each in (pose, other))
+    chord = min(math.dist(first, second), math.dist(first, tuple(-component for component in second)))
+    return 4.0 * math.asin(min(0.5 * chord, 1.0))
 
 
 def _quaternion(pose: Pose) -> tuple[float, ...]:

@@ -192,6 +192,6 @@ def _warn_of_the_arm(scene: Scene, actions: list[tuple[Action, str]], campaign: 
     """Warn of actions that the laboratory's arm can't make."""
     for action, name in actions if campaign.laboratory.arm is not None else ():
         try:
-            path_of(scene, action, campaign.laboratory.arm)
+            path_of(scene, action, campaign.laboratory.expected_arm)
         except InvalidActionError as error:
             warnings.warn(f"{name}{action.display()}: {error}", UserWarning, stacklevel=6)

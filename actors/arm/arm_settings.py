@@ -135,6 +135,10 @@ class ArmSettings(Settings):
         """The settings with what a connected arm reports about its own geometry, for planning."""
         return self
 
+    def expected(self, *, virtual: bool) -> Self:
+        """The settings with the geometry that a connected arm will have, as far as it is known before: for checks."""
+        return self
+
     @property
     def title(self) -> str:
         """Name of the arm in messages."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 from pydantic import Field, Strict
 
 from actors.arm.arm_settings import ArmSettings
-from actors.arm.ur.robot_models import MODELS, Calibration, RobotModel
+from actors.arm.ur.robot_models import MODELS, Calibration, RobotModel, plausible_calibration
 from actors.arm_geometry import ArmLimits, Centre, JointAngles, Mount, Pose, RobotCell, Speed
 from sim_engine.settings.model import NOT_IN_FINGERPRINT, SET_BY_PROGRAM, Choice, Example, FilePath, Text
 from sim_engine.settings.quantity import Quantity
@@ -81,7 +81,7 @@ class UrArmSettings(ArmSettings):
     """Objects around the arm: the laboratory's section `cell`."""
 
     calibration_file: Annotated[FilePath | None, NOT_IN_FINGERPRINT] = None
-    """Recording of this robot by 'decant robot check --record', with whose calibrated lengths pours are checked before it is connected; nominal lengths unless given."""  # noqa: E501
+    """Recording of this robot by 'decant robot check --record', with whose calibrated lengths pours are checked before it is connected; those of a plausible robot unless given."""  # noqa: E501
 
     calibration: Annotated[Calibration | None, SET_BY_PROGRAM] = None
     """Calibration of this robot: as `calibration_file` records it, and once it is connected, as its controller reports it. None for nominal lengths."""  # noqa: E501
@@ -98,6 +98,11 @@ class UrArmSettings(ArmSettings):
     def fitted_to(self, facts: ArmFacts) -> Self:
         """See `ArmSettings.fitted_to`: the robot's calibration."""
         return self.with_values(calibration=getattr(facts, "kinematics", None))
+
+    def expected(self, *, virtual: bool) -> Self:
+        """See `ArmSettings.expected`: the recorded calibration; else, and on a virtual bench, a plausible one."""
+        recorded = None if virtual else self.calibration
+        return self.with_values(calibration=recorded or plausible_calibration(MODELS[self.model]))
 
     @property
     def title(self) -> str:

@@ -29,7 +29,16 @@ from actors.bench.cell_liquids import RESERVOIR, CellLiquids
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.liquid_supply import LiquidSupply
 from actors.bench.pour_feasibility import vessel as built
-from actors.bench.vessel_carrying import Load, MotionConsent, VesselCarrier, Ways, check_carrying, label, move_question
+from actors.bench.vessel_carrying import (
+    Load,
+    MotionConsent,
+    VesselCarrier,
+    Ways,
+    check_carrying,
+    check_pour_path,
+    label,
+    move_question,
+)
 from actors.bench.vessel_handling import WRONG, plan_emptying
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import LOST, source_of
@@ -284,8 +293,7 @@ class DoseHandling:
         shapes = shapes_of(self._places, self._loads)
         cup_vessel = self._vessels[self.names(scene, dose)[1]]
         self._emptying = plan_waste(self._at_places, spec, scene, cup_vessel, shapes) if dose.emptied else None
-        if problems := arm_kind(spec).in_the_way(path, shapes[source_name], self._at_places, shapes):
-            raise InvalidActionError("; ".join(problems))
+        check_pour_path(path, shapes[source_name], self._at_places, spec, shapes)
 
     # ---- before the dose
 

@@ -138,6 +138,29 @@ def check_carrying(
     return ways
 
 
+def check_pour_path(
+    path: PlannedPour,
+    pourer: Vessel,
+    places: Sequence[PlaceSettings],
+    spec: ArmSettings,
+    vessels: Mapping[str, Vessel],
+) -> None:
+    """Check that a planned pour passes the vessels that may stand at the places.
+
+    Args:
+        path: of the pour.
+        pourer: vessel in the gripper.
+        places: as in `check_carrying`.
+        spec: of the arm.
+        vessels: by the names in `holds`.
+
+    Raises:
+        InvalidActionError: it comes too near to some; the text lists all.
+    """
+    if problems := arm_kind(spec).in_the_way(path, pourer, places, vessels):
+        raise InvalidActionError("; ".join(problems))
+
+
 def _refused(problems: Mapping[str, str]) -> InvalidActionError:
     """The error with all problems and their vessels; of a rack with many, its text has the first ones."""
     more = f"; and {len(problems) - SHOWN} more" if len(problems) > SHOWN else ""

@@ -26,7 +26,15 @@ from actors.bench.cell_liquids import CellLiquids
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.liquid_supply import LiquidSupply
 from actors.bench.pour_feasibility import vessel as built
-from actors.bench.vessel_carrying import Load, MotionConsent, VesselCarrier, Ways, check_carrying, move_question
+from actors.bench.vessel_carrying import (
+    Load,
+    MotionConsent,
+    VesselCarrier,
+    Ways,
+    check_carrying,
+    check_pour_path,
+    move_question,
+)
 from actors.grippers.gripper_interface import GripperSettings
 from actors.interfaces import InvalidActionError, LaboratoryError, Notice, OperatorQuestion
 from actors.places import ROLES, Layout, PlaceSettings
@@ -92,6 +100,12 @@ def check_handling(places: Sequence[PlaceSettings], spec: ArmSettings, gripper: 
             f"{1e6 * liquid.volume:.0f} ml"
         )
     return check_carrying((layout.balance, *layout.rest.values()), places, spec, gripper, _loads(scene))
+
+
+def check_path(path: PlannedPour, places: Sequence[PlaceSettings], spec: ArmSettings, scene: Scene) -> None:
+    """Check that a planned pour passes the vessels of a scene at the places of a cycle; see `check_pour_path`."""
+    vessels = {role: load.vessel for role, load in _loads(scene).items()}
+    check_pour_path(path, vessels["pourer"], places, spec, vessels)
 
 
 def plan_back(places: Sequence[PlaceSettings], spec: ArmSettings, scene: Scene) -> PlannedPour:
@@ -209,11 +223,8 @@ class VesselHandling:
         if not self._ways or before != (spec, scene):
             self._ways = check_handling(self._places, spec, carrier.held.spec, scene)
             self._back = plan_back(self._places, spec, scene)
-        loads = _loads(scene)
-        carrier.loads, carrier.ways = loads, self._ways
-        vessels = {role: load.vessel for role, load in loads.items()}
-        if problems := arm_kind(spec).in_the_way(path, vessels["pourer"], self._places, vessels):
-            raise InvalidActionError("; ".join(problems))
+        carrier.loads, carrier.ways = _loads(scene), self._ways
+        check_path(path, self._places, spec, scene)
 
     # ---- the cycle
 

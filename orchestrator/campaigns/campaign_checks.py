@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from actors.arm.arm_interface import PlannedPour
 from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.bench.pour_feasibility import path_of
 from actors.bench.pour_feasibility import vessel as built
@@ -377,7 +378,7 @@ class _Checker:
             vessels: of mixtures; empty: the only source, and one cup after the other.
         """
         from actors.bench.dose_handling import check_vessels, plan_waste, shapes_of, vessels_of
-        from actors.bench.vessel_carrying import SHOWN
+        from actors.bench.vessel_carrying import SHOWN, check_pour_path
 
         assert self.arm is not None
         assert self.gripper is not None
@@ -386,19 +387,25 @@ class _Checker:
             text = "with places these doses have one source; several ones, each with its place, are those of 'mixtures'"
             self.add((section,), text)
             return
-        series = [vessels] if vessels else []
+        series = [(vessels, plan.scenes)] if vessels else []
         if not vessels:
-            most = {dose.receiver: dose for dose in sorted(plan.doses, key=lambda dose: dose.amount)}
-            series = [
-                vessels_of(self.places, plan.scene(plan.sources[0], name), DoseTarget(dose.amount, dose.limit))
-                for name, dose in most.items()
-            ]
-        for each in series:
+            for name, mass, limit in dict.fromkeys((dose.receiver, dose.amount, dose.limit) for dose in plan.doses):
+                scene = plan.scene(plan.sources[0], name)
+                series.append((vessels_of(self.places, scene, DoseTarget(mass, limit)), (scene,)))
+        for each, scenes in series:
             try:
                 at_places, loads, _ = check_vessels(self.places, each, self.arm, self.gripper)
+                shapes = shapes_of(self.places, loads)
+                for scene in scenes:
+                    try:
+                        path = arm_kind(self.arm).plan(scene, scene.action({}))
+                    except InvalidActionError:
+                        continue  # which `doses` reports
+                    check_pour_path(path, built(scene.pourer), at_places, self.arm, shapes)
                 if plan.mixtures is not None and plan.mixtures.on_miss != "accept" and not plan.mixtures.spares:
                     cup = next(vessel for vessel in each if not vessel.liquid)
-                    plan_waste(at_places, self.arm, plan.scenes[0], cup, shapes_of(self.places, loads))
+                    for scene in scenes:
+                        plan_waste(at_places, self.arm, scene, cup, shapes)
             except InvalidActionError as error:
                 for text, vessel in itertools.islice(error.problems.items(), SHOWN):
                     self.add((*_dosed(plan, vessel), section), text)
@@ -445,10 +452,8 @@ class _Checker:
         Args:
             barred: places that the arm can't reach from home with any motion. Filled here.
         """
-        if self.arm is None:
-            return ""
         try:
-            path_of(scene, action, self.arm)
+            check_action(scene, action, self.arm, self.places)
         except InvalidActionError as error:
             if isinstance(error, UnreachablePlaceError):
                 barred.add(_place(action))
@@ -465,7 +470,7 @@ class _Checker:
         try:
             problem = touch(scene, action := scene.action({}), *vessels)
             if problem is None:
-                path_of(scene, action, self.arm)
+                check_action(scene, action, self.arm, self.places)
         except (InvalidActionError, ValueError) as error:
             problem = str(error)
         if problem is not None:
@@ -619,7 +624,14 @@ def check_campaign(
         document = None  # a plan without a file
     lab = plan.laboratory
     checker = _Checker(
-        plan.source, lab.arm, lab.gripper, all_places(lab.places), document, warn, doing, plan.parameters.particles
+        plan.source,
+        lab.expected_arm,
+        lab.gripper,
+        all_places(lab.places),
+        document,
+        warn,
+        doing,
+        plan.parameters.particles,
     )
     at: Loc
     if (problem := why_not_writable(plan.outputs.folder)) is not None:
@@ -704,6 +716,31 @@ def check_vessels(
     checker = _Checker(source, warn=warn)
     checker.scene(scene, _Role(f"{scene.pourer.name} into {scene.receiver.name}"), wanted)
     return checker.problems
+
+
+def check_action(
+    scene: Scene, action: Action, arm: ArmSettings | None, places: Sequence[PlaceSettings]
+) -> PlannedPour | None:
+    """Check a pour as the bench does before it begins.
+
+    Args:
+        scene: vessels and liquid.
+        action: how to pour.
+        arm: as it is expected to be (`LaboratorySettings.expected_arm`); None on a bench without one.
+        places: between which it carries the vessels.
+
+    Returns:
+        The planned pour; None without an arm.
+
+    Raises:
+        InvalidActionError: see `path_of`; or it comes too near to a vessel at another place.
+    """
+    path = path_of(scene, action, arm)
+    if places and arm is not None and path is not None:
+        from actors.bench.vessel_handling import check_path
+
+        check_path(path, places, arm, scene)
+    return path
 
 
 def touch(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str | None:

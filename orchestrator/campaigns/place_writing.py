@@ -12,8 +12,10 @@ import math
 import os
 import re
 from io import StringIO
+from itertools import chain
 from pathlib import Path
 
+from pydantic import ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import YAMLError
@@ -30,6 +32,9 @@ RACKS = ("tubeRack", "aluminumBlock", "other")
 
 ON_GRID = 0.5
 """Largest distance of a well from the grid of its rack [mm]."""
+
+LEAST_APPROACH = 0.12
+"""Height above a taught rack from which the tool comes down, unless its vessels stand deeper [m]."""
 
 LIFT = 10e-3
 """Height above a rack to which a vessel is lifted at least before it moves sideways [m]."""
@@ -103,6 +108,9 @@ def labware_rack(path: Path) -> tuple[RackSettings, float]:
         schema, wells, meta = labware["schemaVersion"], labware["wells"], labware["metadata"]
         category, name = str(meta["displayCategory"]), str(meta["displayName"])
         cells = {key: tuple(float(well[axis]) for axis in ("x", "y", "z", "depth")) for key, well in wells.items()}
+        tips = bool(labware.get("parameters", {}).get("isTiprack"))
+        if not all(map(math.isfinite, chain.from_iterable(cells.values()))):
+            raise ValueError("a length is no number")
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise DecantError(
             f"{path}: should be a labware definition of Opentrons with 'schemaVersion', 'metadata' and 'wells', each "
@@ -110,7 +118,7 @@ def labware_rack(path: Path) -> tuple[RackSettings, float]:
         ) from None
     if schema not in (2, 3):
         raise DecantError(f"{path}: has schemaVersion {schema!r}; 2 and 3 can be read")
-    if category not in RACKS or labware.get("parameters", {}).get("isTiprack"):
+    if category not in RACKS or tips:
         raise DecantError(
             f"{path}: '{name}' is a {category}: its wells are part of it, and no gripper can grip them or take them "
             f"out; a rack has the displayCategory {' or '.join(RACKS[:2])}"
@@ -133,13 +141,34 @@ def labware_rack(path: Path) -> tuple[RackSettings, float]:
                 f"{path}: '{name}' is not one regular grid: with the pitch of A1, A2 and B1, {key} {where}. Make one "
                 "place for each regular part"
             )
+    for pitch, lines, second, where in (
+        (row_pitch, "rows", "B1", "y of A1 should be larger than that of B1"),
+        (column_pitch, "columns", "A2", "x of A2 should be larger than that of A1"),
+    ):
+        if pitch < 0.0:
+            raise DecantError(
+                f"{path}: the {lines} of '{name}' are counted from the wrong side: seen from above, A1 is at the "
+                f"back left and {second} the next one, so that {where}. Name the wells so"
+            )
     if (narrowest := min(abs(row_pitch), abs(column_pitch))) < FINGERS:
         raise DecantError(
             f"{path}: the positions of '{name}' are {narrowest:.3g} mm apart, as those of a plate or of strips: no "
             "fingers fit between them"
         )
-    rack = RackSettings(rows=rows, columns=columns, row_pitch=1e-3 * row_pitch, column_pitch=1e-3 * column_pitch)
-    return rack, 1e-3 * depth + LIFT
+    values = {"rows": rows, "columns": columns, "row_pitch": 1e-3 * row_pitch, "column_pitch": 1e-3 * column_pitch}
+    lift = 1e-3 * depth + LIFT
+    try:
+        rack = RackSettings.model_validate(values)
+        PlaceSettings(name="rack", pose=Pose(), tool=Pose(), rack=rack, approach=max(lift, LEAST_APPROACH))
+    except ValidationError as error:
+        raise DecantError(f"{path}: '{name}' {first_problem(error)}") from None
+    return rack, lift
+
+
+def first_problem(error: ValidationError) -> str:
+    """The first problem of values of a place, with the name of its key."""
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
 
 
 def _pose(pose: Pose) -> CommentedMap:

@@ -89,13 +89,14 @@ def consent_to_motion(request: RunRequest, count: str = "", path: PathReport | N
     if laboratory.places:
         names = ", ".join(place.name for place in laboratory.places)
         lines.append(f"vessels        carried between {names}; the gripper opens and closes")
-    assert laboratory.arm is not None, "a laboratory of hardware has an arm"
+    arm = laboratory.expected_arm
+    assert arm is not None, "a laboratory of hardware has an arm"
     checksum = required_checksum(plan)
     if path is not None:
         confirm(laboratory, [*lines, *report_lines(path)])
         return checksum
     print_note(f"planning paths from all over the actions of {plan.name} …")
-    paths = envelope(laboratory.arm, campaign_pours(plan, request.stages))
+    paths = envelope(arm, campaign_pours(plan, request.stages))
     if not paths.reports:
         raise RefusalError(
             f"none of {len(paths.refused)} actions could be poured by this arm; the first: {paths.refused[0]}"

@@ -131,10 +131,10 @@ def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | No
     Raises:
         RefusalError: it can't be made (exit code 2).
     """
-    from actors.bench.pour_feasibility import path_of
     from actors.interfaces import InvalidActionError
+    from actors.places import all_places
     from orchestrator.campaigns.action_assignments import assigned_action
-    from orchestrator.campaigns.campaign_checks import check_vessels
+    from orchestrator.campaigns.campaign_checks import check_action, check_vessels
     from orchestrator.cli.simulate_command import scene_to_simulate, wanted_in
 
     scene, space = scene_to_simulate(plan, scene_name)
@@ -147,7 +147,7 @@ def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | No
     if not plan.laboratory.pours:
         raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans")
     try:
-        planned = path_of(scene, action, plan.laboratory.arm)
+        planned = check_action(scene, action, plan.laboratory.expected_arm, all_places(plan.laboratory.places))
     except InvalidActionError as error:
         raise RefusalError(f"{action.display()}: {error}") from None
     return Chosen(plan, scene, action, planned)
@@ -160,7 +160,7 @@ def _draw(chosen: Chosen, png: Path) -> None:
     from orchestrator.reports.pour_figures import draw_path
     from sim_engine.vessel.vessel import build_vessel
 
-    arm = chosen.plan.laboratory.arm
+    arm = chosen.plan.laboratory.expected_arm
     if not isinstance(chosen.path, PourPath) or not isinstance(arm, UrArmSettings):
         raise RefusalError("--png: draws the joints of an arm, and this arm's path has none")
     pourer, receiver = build_vessel(chosen.scene.pourer), build_vessel(chosen.scene.receiver)

@@ -21,12 +21,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from orchestrator.cli.command_options import EnableMotion, Laboratory
-from orchestrator.cli.console import FAILED, RefusalError, Refused, print_message
+from orchestrator.cli.console import FAILED, RefusalError, Refused, print_message, print_note
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm
     from actors.arm.arm_settings import ArmDiagnostics, ArmSettings, SafetyRecord
-    from actors.arm_geometry import Pose
     from actors.interfaces import DeviceCheck
     from actors.laboratory_settings import LaboratorySettings
     from actors.places import PlaceSettings, RackSettings
@@ -263,10 +262,12 @@ def teach(
     Of a rack, teach A1, then the last positions of column 1 and of row A, such as D1 and A6. How far they are from a
     grid with its pitch is printed. Teach both again after A1.
     """
+    from pydantic import ValidationError
+
     from actors.arm.arm_settings import arm_kind
     from actors.laboratory import reached
-    from actors.places import PlaceSettings, all_places, rack_problem
-    from orchestrator.campaigns.place_writing import write_place
+    from actors.places import PlaceSettings, all_places, rack_problem, rows_behind_others
+    from orchestrator.campaigns.place_writing import LEAST_APPROACH, first_problem, write_place
     from orchestrator.cli.motion_control import connected
     from orchestrator.runs.motion_approval import accepted_checksum
 
@@ -275,6 +276,11 @@ def teach(
         raise without_arm(laboratory, spec, "'decant robot teach' reads the pose of an arm's tool")
     before = next((place for place in spec.places if place.name == name), None)
     grid, lift = _rack(before, rack, labware)
+    fresh = {} if grid is None else {"holds": ("receiver",), "approach": max(LEAST_APPROACH, lift)}
+    try:
+        PlaceSettings(name=name, pose=tool, tool=tool)
+    except ValidationError as error:
+        raise RefusalError(f"place {first_problem(error)}") from None
     if (position is None) != (grid is None) or (grid is not None and position not in grid.corners):
         raise RefusalError(_position_problem(name, position, grid))
     accepted = accepted_checksum(laboratory) if spec.mode == "hardware" else None
@@ -289,7 +295,6 @@ def teach(
         taught = {"rack": grid.with_values(**{corner: pose})}
     elif grid is not None:
         taught |= {"rack": grid.with_values(last_row=None, last_column=None)}
-    fresh = {} if grid is None else {"holds": ("receiver",), "approach": max(0.12, lift)}
     place = before.with_values(**taught) if before is not None else PlaceSettings(name=name, **{**fresh, **taught})
     others = all_places([other for other in spec.places if other.name != name])
     problems = [] if place.rack is None else [text for text in [rack_problem(place)] if text]
@@ -305,21 +310,22 @@ def teach(
         print_message(f"{laboratory}: place '{name}' is at x {x:.1f}, y {y:.1f}, z {z:.1f} mm ({place.use})")
         return
     print_message(f"{laboratory}: '{name}/{position}' is at x {x:.1f}, y {y:.1f}, z {z:.1f} mm")
-    missing = [
-        name for name, key in zip([*place.rack.corners][1:], _taught_keys(place.rack), strict=True) if key is None
-    ]
+    if text := rows_behind_others(place):
+        print_note(text)
+    corners = zip([*place.rack.corners][1:], place.rack.taught_corners, strict=True)
+    missing = [name for name, pose in corners if pose is None]
     residual = f"residual of the taught positions: {1e3 * place.rack.positions(place.pose)[1]:.2f} mm"
     print_message(f"{residual}; still to be taught: {', '.join(missing)}" if missing else residual)
 
 
 def _rack(before: PlaceSettings | None, text: str | None, labware: Path | None) -> tuple[RackSettings | None, float]:
-    """The rack that is taught, and the height of its approach [m]; None and 0 for a single place."""
+    """The rack that is taught, and the height to which vessels are lifted out of it [m]; None for a place."""
     from pydantic import ValidationError
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
     from actors.places import RackSettings
-    from orchestrator.campaigns.place_writing import labware_rack
+    from orchestrator.campaigns.place_writing import first_problem, labware_rack
 
     known = None if before is None else before.rack
     if text is None and labware is None:
@@ -334,8 +340,7 @@ def _rack(before: PlaceSettings | None, text: str | None, labware: Path | None) 
     except YAMLError:
         raise RefusalError(f"--rack: '{text}' should be keys and values, such as 'rows: 4, columns: 6'") from None
     except ValidationError as error:
-        first = error.errors()[0]
-        raise RefusalError(f"--rack: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise RefusalError(f"--rack: {first_problem(error)}") from None
 
 
 def _position_problem(name: str, position: str | None, rack: RackSettings | None) -> str:
@@ -346,11 +351,6 @@ def _position_problem(name: str, position: str | None, rack: RackSettings | None
         )
     given = "name one" if position is None else f"not {position}"
     return f"'{name}' is a rack, which is taught at {', '.join(rack.corners)}: {given}"
-
-
-def _taught_keys(rack: RackSettings) -> list[Pose | None]:
-    """The poses of the corners after A1, as far as they are taught."""
-    return [getattr(rack, "last_row" if row else "last_column") for row, _ in [*rack.corners.values()][1:]]
 
 
 def try_place(laboratory: Laboratory, name: PlaceName, enable_motion: EnableMotion = False) -> None:

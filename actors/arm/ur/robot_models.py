@@ -150,6 +150,48 @@ MODELS = {
 }
 """Models by their names in configuration files."""
 
+_CB3_DIFFERENCES = (
+    (-7.290070070824746e-05, -0.01713897289704999, -0.03707159413492756, 0.054279462160583214, 1.488984257025741e-07,
+     1.551499479707493e-05),
+    (4.6311376834935676e-05, -0.00012568315331862312, 0.00186216581161458, 9.918593870679266e-05,
+     4.215462720453189e-06, 0.0),
+    (0.00065609212979853, 1.4442162376284788, 0.854147723854608, -2.2989425877563705, -1.573498686836816e-05,
+     1.9072435590711256e-05),
+    (0.000211987863869334, -0.0072553625957652995, -0.013483226769541364, 0.0013495820227329425,
+     -0.001263136163679901, 0.0),
+)  # fmt: skip
+
+_E_SERIES_DIFFERENCES = (
+    (-2.41478068943590252e-07, 1.60233952386694556, -1.68607190752171299, 0.0837331147700118711,
+     -1.01260355871157781e-07, 3.91986209186123702e-08),
+    (2.12234865571205891e-05, 0.632017132627700651, 0.00229833638891230319, -4.61409023720933908e-05,
+     -6.39280053471801522e-05, 0.0),
+    (-0.000160188285741325043, 439.140974079900957, -446.027059806332147, 6.88618689642360149,
+     -3.86588496858186748e-05, -0.00087908274257374186),
+    (-0.000650246557584166496, 0.00139416666825590402, 0.00693818880325995126, -0.000811641562390219562,
+     0.000411120504570705592, 0.0),
+)  # fmt: skip
+
+
+def plausible_calibration(model: RobotModel) -> Calibration:
+    """The calibration of a plausible robot: the virtual controller reports it, and checks before a connection use it.
+
+    The differences from nominal are those of a UR10 and of a UR10e, from the tests of the manufacturer's ROS driver,
+    with lengths in proportion to the upper arm. In the second one, axes 2 and 3 are nearly parallel: d2 and d3 are
+    hundreds of metres.
+    """
+    theta, a, d, alpha = _CB3_DIFFERENCES if model.cb3 else _E_SERIES_DIFFERENCES
+    size = model.a2 / MODELS["ur10" if model.cb3 else "ur10e"].a2
+    nominal = model.nominal.parameters
+
+    def shifted(values: Joints, differences: Joints, scale: float = 1.0) -> Joints:
+        base, two, three, four, five, six = (v + scale * x for v, x in zip(values, differences, strict=True))
+        return base, two, three, four, five, six
+
+    return Calibration(
+        theta, shifted(nominal.a, a, size), shifted(nominal.d, d, size), shifted(nominal.alpha, alpha), "virtual"
+    )
+
 
 def model_named(name: str, software: Sequence[int]) -> str:
     """The name in configuration files of the model that a controller reports; its own name if it is not supported.

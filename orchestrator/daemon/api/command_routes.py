@@ -59,7 +59,7 @@ def what_moves(daemon: SharedServices, item: QueueItem) -> WhatMovesOut:
         raise MotionNotEnabledError(f"{item.id} is {item.state}")
     try:
         work = run_request(daemon.settings, item, daemon.settings.rig(item.rig))
-        arm = work.campaign.laboratory.arm
+        arm = work.campaign.laboratory.expected_arm
         assert arm is not None, "a laboratory of hardware has an arm"
         required_checksum(work.campaign)
         paths = envelope(arm, campaign_pours(work.campaign, work.stages))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,12 +11,17 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from actors.arm.arm_settings import arm_kind
 from actors.arm_geometry import Pose
-from actors.places import PlaceSettings, RackSettings
+from actors.interfaces import InvalidActionError
+from actors.places import PlaceSettings, RackSettings, rack_problem, rows_behind_others
 from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.campaigns.place_writing import labware_rack, write_place
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli.app import app
 from sim_engine.errors import DecantError
+from sim_engine.vessel.shapes import cylinder
+from sim_engine.vessel.vessel import build_vessel
 
 NIGHT = Path(__file__).parents[3] / "configs" / "laboratories" / "night.yaml"
 
@@ -64,6 +70,21 @@ def _well(name: str, **values: float) -> Labware:
 def _without(name: str) -> Labware:
     definition = tubes()
     del definition["wells"][name]
+    return definition
+
+
+def _mirrored(axis: str) -> Labware:
+    """Rows counted from the front, as Opentrons' users number their own racks, or columns from the right."""
+    definition = tubes()
+    for well in definition["wells"].values():
+        well[axis] = 100.0 - well[axis]
+    return definition
+
+
+def _apart(factor: float, **values: float) -> Labware:
+    definition = tubes()
+    for well in definition["wells"].values():
+        well.update({"x": well["x"] * factor, "y": well["y"] * factor, **values})
     return definition
 
 
@@ -118,6 +139,14 @@ def test_public_racks_are_read(name: str, tmp_path: Path) -> None:
         ({"ordering": []}, "should be a labware definition of Opentrons with 'schemaVersion'"),
         (_well("A1", depth="deep"), "each with x, y, z and depth"),  # type: ignore[arg-type]
         ("{", "should be a labware definition of Opentrons"),
+        (_mirrored("y"), "the rows of 'six tubes' are counted from the wrong side: seen from above, A1 is at the back"),
+        (_mirrored("x"), "the columns of 'six tubes' are counted from the wrong side"),
+        (_apart(30.0), "'six tubes' row_pitch: "),  # in another unit than mm
+        (_apart(1.0, depth=600.0), "'six tubes' approach: "),
+        (_well("A2", x=float("nan")), "a length is no number"),
+        (_apart(1.0, depth=float("inf")), "a length is no number"),
+        ({**tubes(), "parameters": None}, "should be a labware definition of Opentrons"),
+        ([tubes()], "should be a labware definition of Opentrons"),
     ],
 )
 def test_labware_whose_vessels_cannot_be_taken_out_is_refused(value: Any, message: str, tmp_path: Path) -> None:
@@ -174,8 +203,90 @@ def test_a_rack_is_taught_at_its_corners_alone(teach: Says, tmp_path: Path) -> N
     assert "residual of the taught positions: 0.00 mm; still to be taught: B1, A3" in said
     rack = load_laboratory(tmp_path / "lab.yaml").places[-1]
     assert (rack.name, rack.holds) == ("shelf", ("receiver",))
+    assert "only row" not in said  # its rows rise
     # the arm has not moved: the corner would be at A1, 100 mm beside its place
     said = teach("shelf", "B1")
     assert said.startswith("2 ")
     assert "nothing is written: the taught positions of 'shelf' are up to 50.0 mm away from a grid" in said
     assert load_laboratory(tmp_path / "lab.yaml").places[-1] == rack
+
+
+def test_a_flat_rack_is_called_so_when_it_is_taught(teach: Says, tmp_path: Path) -> None:
+    said = teach("tubes", "A1", "--labware", str(labware(tmp_path, tubes())))
+    assert said.startswith("0 ")
+    said = " ".join(said.split())
+    # the tool reaches along the base's x, and so do the columns of a rack whose direction is 0
+    assert "with vessels everywhere only column 1 can be used" in said
+    assert "Put vessels into one column at a time" in said
+
+
+@pytest.mark.parametrize("name", ["a rack", "x" * 61, "shelf/left/top"])
+def test_a_name_that_no_place_can_have_is_refused_before_the_arm_is_read(name: str, teach: Says) -> None:
+    assert teach(name).startswith("2 ")
+    assert "place name: " in teach(name)
+
+
+def _rack(reach: Pose, **values: Any) -> PlaceSettings:
+    grid = {"rows": 3, "columns": 2, "row_pitch": 0.12, "column_pitch": 0.1, "direction": 1.5708, **values}
+    return PlaceSettings(name="rack", pose=reach, tool=Pose(z=0.17), rack=RackSettings(**grid))
+
+
+FORWARDS, BACKWARDS, DOWN = (
+    Pose.of(0.55, 0.25, 0.08, *turn) for turn in (TURN, (1.2092, -1.2092, -1.2092), (3.1416, 0.0, 0.0))
+)
+
+
+@pytest.mark.parametrize(
+    ("place", "only"),
+    [
+        (_rack(FORWARDS), "row A can be used, since the tool would pass through the vessels before B, C"),
+        (_rack(BACKWARDS), "row C can be used, since the tool would pass through the vessels before B, A"),
+        (_rack(FORWARDS, direction=0.0), "column 1 can be used"),
+        (_rack(FORWARDS, row_rise=0.12), ""),
+        (_rack(FORWARDS, rows=1), ""),
+        (_rack(DOWN), ""),
+    ],
+)
+def test_rows_behind_others_are_those_in_the_direction_in_which_the_tool_reaches(
+    place: PlaceSettings, only: str
+) -> None:
+    text = rows_behind_others(place)
+    assert only in text
+    assert bool(only) == bool(text)
+
+
+def test_what_is_said_about_a_flat_rack_is_what_the_ways_to_it_show() -> None:
+    lab = load_laboratory(NIGHT.with_name("rack.yaml"))
+    shipped = next(place for place in lab.places if place.rack is not None)
+    assert shipped.rack is not None
+    assert lab.expected_arm is not None
+    flat = shipped.with_values(holds=("cup",), rack=shipped.rack.with_values(rows=2, columns=1, row_rise=0.0))
+    assert "only row A can be used" in rows_behind_others(flat)
+    cup, kind = (
+        build_vessel(cylinder("cup", inner_radius=0.028, inner_height=0.08, wall=0.003)),
+        arm_kind(lab.expected_arm),
+    )
+    front, behind = flat.each
+    kind.way(front, flat.each, {"cup": cup})
+    with pytest.raises(InvalidActionError, match="a vessel at 'rack/A1'"):
+        kind.way(behind, flat.each, {"cup": cup})
+    kind.way(behind, (behind,), {"cup": cup})  # one row at a time
+
+
+@pytest.mark.parametrize("degrees", [0.0, 9.0, 11.0, 20.0, 90.0, 180.0])
+def test_a_corner_that_is_taught_with_the_tool_turned_is_refused_with_the_angle(degrees: float) -> None:
+    pose = Pose.of(0.55, 0.25, 0.08, 0.0, 0.0, 0.0)
+    turned = Pose.of(0.55, 0.35, 0.08, 0.0, 0.0, math.radians(degrees))
+    place = _rack(pose, rows=1, last_column=turned)
+    text = f"at A2 of 'rack' the tool was turned by {degrees:.0f} deg from where it was at A1, and 10 deg are allowed"
+    assert rack_problem(place).startswith(text) == (degrees > 10.0)
+
+
+def test_a_file_whose_corners_are_turned_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rack.yaml"
+    turned = "rx: 2.7800 rad, ry: 1.2092 rad, rz: 1.2092 rad"
+    corner = f", last_column: {{x: 550 mm, y: 750 mm, z: 80 mm, {turned}}}, direction: 90 deg}}"
+    text = NIGHT.with_name("rack.yaml").read_text(encoding="utf-8")
+    path.write_text(text.replace(", direction: 90 deg}", corner), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"at A6 of 'rack' the tool was turned by \d\d deg"):
+        load_laboratory(path)

@@ -56,6 +56,7 @@ def test_every_model_tells_its_type_limits_and_calibration(model: str) -> None:
     own = calibrated(CONTROLLED[model]).calibration
     assert own is not None
     assert state.calibration == replace(own, checksum=state.calibration.checksum if state.calibration else "")
+    assert cell_of(model).expected(virtual=True).calibration == own  # with which pours are checked before
     assert compared(state, model) == []
 
 
