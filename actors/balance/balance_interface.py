@@ -184,9 +184,12 @@ def unsettled(
             )
     if in_turn(masses):
         return NotStableError, f"no stable weight within {within:g} s: {IN_TURN}"
+    flag = str(seen.status)
+    if seen.status is ReadingStatus.STABLE:
+        flag = "marked as stable, but not the same for long enough"
     return (
         NotStableError,
-        f"no stable weight within {within:g} s (last {shown or 'nothing'}, {seen.status}). Is something touching the "
+        f"no stable weight within {within:g} s (last {shown or 'nothing'}, {flag}). Is something touching the "
         "tray, is it still dripping, is there a draught? Then weigh again; if it never rests, set a slower filter in "
         f"its menu, or allow more 'steps' in the laboratory's file.{cable}",
     )

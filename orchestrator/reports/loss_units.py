@@ -38,13 +38,15 @@ class LossUnit:
     def prediction(self, predicted: Prediction) -> str:
         """'1.2 ± 0.9 %, a pour ± 0.5 %': deviation of the mean, and deviation of a single pour.
 
-        If its prediction interval is known: '1.2 ± 0.9 %, a pour: 0.0 … 3.1 %'.
+        If its prediction interval is known: '1.2 ± 0.9 %, a pour: 0.0 … 3.1 %'. A mean that is less certain than the
+        interval is wide depends on pours outside of it: '1.2 ± 4.3 %, a pour: 0.0 … 3.1 %, seldom far more'.
         """
         expected = self.text(predicted.mean, predicted.deviation)
         if predicted.band is None:
             return expected + self.scatter(predicted.scatter)
         low, high = (f"{self.factor * end:.{self.decimals}f}" for end in predicted.band)
-        return f"{expected}, a pour: {low} … {high} {self.unit}"
+        tail = ", seldom far more" if predicted.deviation > predicted.band[1] - predicted.band[0] else ""
+        return f"{expected}, a pour: {low} … {high} {self.unit}{tail}"
 
     def scatter(self, deviation: float | None) -> str:
         """The end of a prediction: ', a pour ± 0.5 %'; empty if unknown."""

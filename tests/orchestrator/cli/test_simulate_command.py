@@ -72,7 +72,8 @@ def test_simulate_tells_people_the_spread_and_what_is_not_simulated(inputs: Path
     assert re.search(r"received \d+\.\d ± \d+\.\d %", done.stdout)
     assert "mean ± standard deviation, 2 seeds" in done.stdout
     assert re.search(
-        r"spilled / poured \d+\.\d ± \d+\.\d %, a pour: \d+\.\d … \d+\.\d %   \(intervals from seeds", done.stdout
+        r"spilled / poured \d+\.\d ± \d+\.\d %, a pour: \d+\.\d … \d+\.\d %   \(uncalibrated: intervals from seeds",
+        done.stdout,
     )
     assert re.search(r"delivered \d+\.\d g, \d+\.\d mL", done.stdout)
     assert done.stderr.count("not simulated, dribbling: ") == 1  # for both seeds

@@ -342,6 +342,8 @@ def test_the_line_of_a_pour_says_both() -> None:
     assert loss_unit(Loss()).prediction(predicted) == "0.80 ± 0.90 %, a pour ± 0.50 %"
     assert loss_unit(Loss()).prediction(replace(predicted, scatter=None)) == "0.80 ± 0.90 %"
     assert loss_unit(Loss()).prediction(replace(predicted, band=(0.0, 0.021))) == "0.80 ± 0.90 %, a pour: 0.00 … 2.10 %"
+    rare = Prediction(0.0162, 0.0432, None, (0.0, 0.0262))  # a few simulations spill everything
+    assert loss_unit(Loss()).prediction(rare) == "1.62 ± 4.32 %, a pour: 0.00 … 2.62 %, seldom far more"
     plan = example_run.campaign()
     tally = ProgressState(plan)
     for event in example_run.events(plan):
