@@ -11,6 +11,7 @@ This module has no slow imports.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import importlib.metadata
@@ -18,7 +19,9 @@ import importlib.util
 import logging
 import os
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim_engine.errors import EngineError, WrongOutcomeError
@@ -29,6 +32,9 @@ if TYPE_CHECKING:
     from sim_engine.scene import PourTask
 
 VARIABLE = "DECANT_ENGINE"
+
+LONGEST_COMPILATION = 90.0
+"""Longest wait for the kernels of another process [s], ten times the usual time."""
 
 ENGINES = ("taichi", "quadrants")
 """Supported packages; without `DECANT_ENGINE` the first one that can be loaded is used."""
@@ -133,6 +139,43 @@ def check_task() -> PourTask:
     return PourTask(scene, action, SimulationParameters(particles=200), seed=1)
 
 
+@contextlib.contextmanager
+def compiling_alone(cancelled: Callable[[], bool]) -> Iterator[None]:
+    """Context of a process's first pours: on a machine that has no kernels yet, one process compiles them at a time.
+
+    Compiling takes eight seconds of a core, and loading what another process has compiled takes one. If the cache
+    cannot be written, or if the others take longer than `LONGEST_COMPILATION`, each process compiles.
+
+    Args:
+        cancelled: ends the wait for another process.
+    """
+    with contextlib.ExitStack() as held:
+        with contextlib.suppress(ImportError, OSError, EngineError):
+            import fcntl  # Windows has none
+
+            record = _record()
+            lock = held.enter_context((record.parent / "compiling").open("a", encoding="utf-8"))
+            end = time.monotonic() + LONGEST_COMPILATION
+            while not cancelled() and time.monotonic() < end:
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    time.sleep(0.1)
+            if record.exists():
+                held.close()
+        yield
+
+
+def _record() -> Path:
+    """The file that says that this version of engine and solver has passed its check on this machine."""
+    from sim_engine.resources import cache_directory
+    from sim_engine.solver_fingerprint import ROOT, folder_digest
+
+    solver = folder_digest(ROOT / "sim_engine" / "fluid")
+    return cache_directory() / f"checked-{engine_version().replace(' ', '-')}-{solver}.txt"
+
+
 def check_engine(pour: Callable[[PourTask], PourOutcome]) -> None:
     """Compare a pour with its stored outcome, unless a record in the cache says that this version has passed.
 
@@ -145,11 +188,8 @@ def check_engine(pour: Callable[[PourTask], PourOutcome]) -> None:
         WrongOutcomeError: the outcome lies outside the accepted deviations.
     """
     from sim_engine.resources import cache_directory
-    from sim_engine.solver_fingerprint import ROOT, folder_digest
 
-    version = engine_version()
-    solver = folder_digest(ROOT / "sim_engine" / "fluid")
-    record = cache_directory() / f"checked-{version.replace(' ', '-')}-{solver}.txt"
+    version, record = engine_version(), _record()
     if record.exists():
         return
     outcome = pour(check_task())

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
+from sim_engine.engine_package import compiling_alone
 from sim_engine.errors import EngineError, InvalidSceneError, SimulationCancelled
 from sim_engine.outcome import SimulatedPour
 from sim_engine.scene import PourTask
@@ -58,7 +59,8 @@ class JobRunner:
 
     Kernels are written to the cache when a simulator is closed. If a process is killed before that, the next one on its
     machine compiles them again. Therefore the simulator is closed once after a long first job and created again with
-    the next job, which costs a second.
+    the next job, which costs a second. Processes that start together compile one after the other, so that all but the
+    first load its kernels.
 
     Args:
         make: creates the simulator at the first job, so that an unused process compiles nothing.
@@ -88,7 +90,19 @@ class JobRunner:
         """
         if cancelled():
             raise JobCancelledError  # cancelled while it waited behind another job
-        begun = time.process_time()
+        if not self._is_first:
+            return self._simulated(task, cancelled)
+        with compiling_alone(cancelled):
+            if cancelled():
+                raise JobCancelledError
+            begun = time.process_time()
+            run = self._simulated(task, cancelled)
+            if time.process_time() - begun > self._long_first_job:
+                self.close()
+        self._is_first = False
+        return run
+
+    def _simulated(self, task: PourTask, cancelled: Callable[[], bool]) -> SimulatedPour:
         try:
             if self._simulator is None:
                 self._simulator = self._make()
@@ -103,9 +117,6 @@ class JobRunner:
             raise SimulationError(f"the simulator failed: {type(error).__name__}: {error}") from error
         if not isinstance(run, SimulatedPour):
             raise SimulationError(f"the simulator answered with a {type(run).__name__}, not with a simulated pour")
-        if self._is_first and time.process_time() - begun > self._long_first_job:
-            self.close()
-        self._is_first = False
         return run
 
     def close(self) -> None:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 
 from actors.simulators.job_runner import JobCancelledError, JobRunner
+from sim_engine.resources import ENVIRONMENT_VARIABLE
+from tests.support.waiting import PATIENCE, wait_for
 
 
 def never() -> bool:
@@ -36,3 +40,29 @@ def test_a_job_given_up_before_it_began_costs_nothing(fake, task, tmp_path):
     with pytest.raises(JobCancelledError):
         JobRunner(fake(0.0, log)).simulate(task(), lambda: True)
     assert not log.exists()
+
+
+def test_simulators_that_start_together_compile_one_after_the_other(fake, task, tmp_path, monkeypatch):
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, str(tmp_path / "cache"))
+    logs = [tmp_path / "first", tmp_path / "second"]
+    given_up = threading.Event()
+    first = threading.Thread(target=in_vain, args=(JobRunner(fake(PATIENCE, logs[0])), task(seed=1), given_up.is_set))
+    first.start()
+    wait_for(lambda: logs[0].exists() and "begin" in notes(logs[0]), "first job")
+    polled = []
+
+    def tired() -> bool:
+        polled.append(1)
+        return len(polled) > 3
+
+    in_vain(JobRunner(fake(0.0, logs[1])), task(seed=2), tired)
+    assert not logs[1].exists() or "end" not in notes(logs[1]), "it waits for the kernels of the first"
+    given_up.set()
+    first.join(PATIENCE)
+    JobRunner(fake(0.0, logs[1])).simulate(task(seed=3), never)
+    assert notes(logs[1])[-1] == "end"
+
+
+def in_vain(runner, job, cancelled) -> None:
+    with pytest.raises(JobCancelledError):
+        runner.simulate(job, cancelled)
