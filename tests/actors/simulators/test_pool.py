@@ -360,6 +360,7 @@ def test_a_simulation_that_hangs_past_its_deadline_costs_its_simulator(ray_runni
         pool = ray_pool(1, make=fake(60.0), deadline=1.0)
         with pytest.raises(SimulationError, match="no result within 1 s"):
             await pool.simulate(task())
+        pool._deadline = PATIENCE  # for a simulator that starts on a busy machine
         assert (await pool.simulate(task(name="quick"))).outcome.seed == 1
         await pool.close()
 
