@@ -104,8 +104,9 @@ def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...]) -> None:
             text += f", left: {sum(c.simulations for c in todo)} simulations, {sum(c.pours for c in todo)} pours"
         print(f"{name:34} {text}")
     print(
-        f"{len(cells)} cells, {len(left)} left: at most {simulations} simulations and {pours} pours, some "
-        f"{hours:.2g} CPU hours (an estimate, good to a factor of two). Nothing was started."
+        f"{len(cells)} cells, {len(left)} left: {simulations} simulations and {pours} pours, "
+        f"some {hours:.2g} CPU hours at least. Simulations that score calibrations, and those that D3 adds while none is "
+        "good, are not counted: the study may take two to three times as long. Nothing was started."
     )
 
 
