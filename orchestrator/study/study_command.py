@@ -105,8 +105,8 @@ def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...]) -> None:
         print(f"{name:34} {text}")
     print(
         f"{len(cells)} cells, {len(left)} left: {simulations} simulations and {pours} pours, "
-        f"some {hours:.2g} CPU hours at least. Simulations that score calibrations, and those that D3 adds while none is "
-        "good, are not counted: the study may take two to three times as long. Nothing was started."
+        f"some {hours:.2g} CPU hours at least. Simulations that score calibrations, and those that D3 adds while none "
+        "is good, are not counted: the study may take two to three times as long. Nothing was started."
     )
 
 
