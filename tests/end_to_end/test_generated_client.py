@@ -19,7 +19,7 @@ from tests.support.toy_daemon import HeldBench, HeldLaboratory
 pytestmark = pytest.mark.slow
 
 CAMPAIGN = Path(__file__).parents[2] / "configs" / "campaigns" / "first-pour.yaml"
-PROGRAM = Path(__file__).with_name("generated_client.py")
+PROGRAM = Path(__file__).parents[1] / "support" / "generated_client.py"
 
 # In the place of the campaign's own laboratory, which has a real arm.
 AT_THE_BENCH = """\
