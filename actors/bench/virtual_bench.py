@@ -34,7 +34,7 @@ from actors.dosing.simulated_dose import true_cup
 from actors.grippers.gripper_interface import GripperEmulator, GripperSettings
 from actors.interfaces import DoseTarget, LaboratoryError, SimulatorPool
 from actors.laboratory_settings import BenchSettings
-from actors.runtime.bench_clock import PATIENCE, device_clock
+from actors.runtime.bench_clock import PATIENCE, DeviceClock, device_clock
 from actors.runtime.remote_object import Device
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseError, PourTask, SampledMotion, Scene
@@ -58,6 +58,11 @@ UPRIGHT = math.radians(0.5)
 
 NOTING_INTERVAL = 40.0
 """Interval between two reads of the arm's history [s of controller time]; a virtual controller keeps two minutes."""
+
+CREEP, CREEP_INTERVAL = 0.02, 1.0
+"""Time that passes for the devices [s of the clock] in each interval of wall time [s] in which the liquid is simulated:
+enough for replies of the balance.
+"""
 
 FILM = 0.4e-3
 """Liquid that stays in a receiver that was poured back [kg]; a tenth of it is random."""
@@ -275,6 +280,25 @@ class DeviceEmulators:
     async def close(self) -> None:
         """End both emulators."""
         await self.device.call("close", deadline=DEADLINE)
+
+
+@contextlib.asynccontextmanager
+async def standing(clock: DeviceClock) -> AsyncIterator[None]:
+    """Let the devices' clock almost stand while the liquid is simulated, so that a slow host adds no drift to it."""
+
+    async def hold() -> None:
+        while True:
+            clock.promise("liquid", CREEP)
+            await asyncio.sleep(CREEP_INTERVAL)
+
+    holding = asyncio.create_task(hold())
+    await asyncio.sleep(0)
+    try:
+        yield
+    finally:
+        holding.cancel()
+        await asyncio.gather(holding, return_exceptions=True)
+        clock.withdraw("liquid")
 
 
 def _film(seed: int) -> float:
@@ -582,7 +606,8 @@ class FollowedBench(VirtualBench):
         """See `VirtualBench.lands`."""
         if not self._landed:
             await self.note()
-        await super().lands(executed, broken)
+        async with standing(self.clock):
+            await super().lands(executed, broken)
         self._times, self._joints = [], []
 
     def _motion(self, executed: Executed | None, grip_tilt: float) -> SampledMotion | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import subprocess
 import sys
 import time
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from actors.bench.virtual_bench import CREEP, standing
 from actors.runtime import bench_clock
 from actors.runtime.bench_clock import DeviceClock, SharedClock, device_clock
 from actors.runtime.child_process import child_environment
@@ -70,3 +72,15 @@ def test_hardware_and_other_machines_have_the_wall_clock(tmp_path: Path) -> None
         assert type(clock) is DeviceClock
         assert clock.patience == 1.0
         assert abs(clock.now - time.monotonic()) < 60.0
+
+
+def test_devices_do_not_age_while_the_liquid_of_the_bench_is_simulated(file: Path) -> None:
+    """On a slow machine the balance drifted by grams meanwhile."""
+    controller, bench = SharedClock(file), SharedClock(file)
+
+    async def simulating() -> None:
+        async with standing(bench):
+            assert not controller.may_pass(2.0 * CREEP)
+        assert controller.may_pass(1e9)
+
+    asyncio.run(simulating())
