@@ -46,7 +46,7 @@ from orchestrator.records.events import Subscriber as Watch
 from orchestrator.records.run_record import read_record
 from orchestrator.reports.publishing import publish_run
 from orchestrator.runs.added_pours import weighed_by_hand
-from orchestrator.runs.resume import LOST
+from orchestrator.runs.resume import LOST, Facts
 from orchestrator.runs.run_service import RunHandle, RunResources, RunService, RunTaskError
 from orchestrator.runs.run_tasks import run_task
 from orchestrator.runs.stages import scenes_of
@@ -314,7 +314,7 @@ class AskTell:
             raise measured
         return measured
 
-    async def _settle(self, question: str, options: Sequence[str]) -> str:
+    async def _settle(self, question: str, options: Sequence[str], facts: Facts) -> str:
         """Answer a question of a run that continues: by the caller, if it is about a pour."""
         if LOST not in options:
             return self._answer or ""

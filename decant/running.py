@@ -43,7 +43,7 @@ from orchestrator.reports.stage_views import evaluation_of
 from orchestrator.reports.validity_warnings import not_simulated
 from orchestrator.runs.bench_check import BenchReport, check_bench
 from orchestrator.runs.motion_approval import read_record
-from orchestrator.runs.resume import OperatorNeededError
+from orchestrator.runs.resume import Facts, OperatorNeededError
 from orchestrator.runs.run_folder import create_run
 from orchestrator.runs.run_service import CheckReport, RunHandle, RunRequest, RunResources, RunService
 from orchestrator.runs.run_tasks import (
@@ -164,7 +164,7 @@ class _Proposals:
         self.record = RunState(Header(campaign.name, {}))
         self._campaign, self._propose = campaign, propose
 
-    async def answer(self, question: str, options: Sequence[str]) -> str:
+    async def answer(self, question: str, options: Sequence[str], facts: Facts) -> str:
         """See `AskOperator`. Raises OperatorNeededError: another question, or mixtures that are impossible."""
         if NO_MORE not in options or "Refused: " in question:
             raise OperatorNeededError(question)

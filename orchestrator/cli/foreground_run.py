@@ -44,7 +44,7 @@ from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_file import MB, TO_BEGIN, JournalError, free_space
 from orchestrator.records.run_record import CampaignResult, read_record, read_result
 from orchestrator.records.states import State
-from orchestrator.runs.resume import AskOperator
+from orchestrator.runs.resume import AskOperator, Facts, shown_fact
 from orchestrator.runs.run_folder import RESOLVED, create_run, find_run
 from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService
 
@@ -405,10 +405,11 @@ def file_trouble(error: OSError, directory: Path) -> str:
 def asked_about_unknown_pours(answer: str | None) -> AskOperator | None:
     """Who is asked about a pour whose outcome is unknown: the command line, the terminal, or nobody."""
     if answer is not None:
-        return lambda question, options: answer
+        return lambda question, options, facts: answer
     return _ask_on_terminal if sys.stdin.isatty() else None
 
 
-async def _ask_on_terminal(question: str, options: Sequence[str]) -> str:
-    print_message(f"\n{question}\n  answer with one of: {' | '.join(options)}")
+async def _ask_on_terminal(question: str, options: Sequence[str], facts: Facts) -> str:
+    lines = [f"  {shown_fact(name):20s} {value}" for name, value in facts.items()]
+    print_message("\n".join(["", question, *lines, f"  answer with one of: {' | '.join(options)}"]))
     return (await asyncio.to_thread(input, "> ")).strip()

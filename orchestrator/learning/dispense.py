@@ -322,7 +322,7 @@ class Dispensed(StageResult):
         masses = {liquid: dose.received_g for liquid, dose in doses.items()}
         known = cup.state in ("full", "missed") and all(mass is not None for mass in masses.values())
         total = sum(mass or 0.0 for mass in masses.values())
-        errors = {liquid: dose.deviation_g or 0.0 for liquid, dose in doses.items()}
+        errors = {liquid: dose.deviation_g for liquid, dose in doses.items() if dose.deviation_g is not None}
         components = []
         for liquid, wanted in sorted(
             cup.wanted_g.items(), key=lambda item: (order.get(item[0], len(self.doses)), item)
@@ -339,7 +339,7 @@ class Dispensed(StageResult):
                     share=share,
                     wanted_share=wanted / sum(cup.wanted_g.values()),
                     share_half_interval=None
-                    if share is None
+                    if share is None or len(errors) < len(doses)
                     else NINETY_PERCENT * share_deviation(liquid, share, errors, total),
                     dose=None if dose is None else dose.number,
                     source="" if dose is None else dose.source,

@@ -34,7 +34,7 @@ from actors.interfaces import LaboratoryError
 from orchestrator.learning.campaign_plan import DispensePlan
 from orchestrator.learning.dispense import ENOUGH, KnownSource, left_after
 from orchestrator.learning.requests import Failed, Outcome, Pour, Poured
-from orchestrator.learning.stage_result import DOSE
+from orchestrator.learning.stage_result import DOSE, entered_by_hand
 from orchestrator.records.events import CampaignOpened, Event, RequestFinished, RequestStarted
 from orchestrator.records.run_registry import make_state_directory, state_directory
 from sim_engine.errors import InvalidArgumentError
@@ -550,7 +550,8 @@ class VesselAccount:
 
         Args:
             plan: of its series.
-            carried: whether the arm carries the cups, whose contents the bench then enters.
+            carried: whether the arm carries the cups, whose contents the bench then enters, but for a dose that a
+                person has entered.
         """
         run = ""
 
@@ -571,7 +572,8 @@ class VesselAccount:
                     name = pour.dose.source.name
                     key = f"{run} {event.stage} {pour.number}"
                     self.finish(plan.tracked(name), pour, outcome, plan.liquid(name), key=key)
-                    if pour.dose.cup and not carried:
+                    entered = isinstance(outcome, Poured) and entered_by_hand(outcome.measurement)
+                    if pour.dose.cup and (entered or not carried):
                         self._note_cup(plan, pour, outcome, key=key)
 
         return subscriber

@@ -49,6 +49,7 @@ class Kind(StrEnum):
     STARTED = "started"
     FINISHED = "finished"
     POUR_STARTED = "pour.started"
+    POUR_READ = "pour.read"
     POUR_WITHDRAWN = "pour.withdrawn"
     POUR_FINISHED = "pour.finished"
     TOLD = "told"
@@ -237,6 +238,22 @@ class RequestStarted(Event):
         if not isinstance(self.request, Pour):
             return {"id": self.id}
         return {"id": self.id, "attempt": self.attempt, "number": self.request.number}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PourRead(JournalEvent):
+    """What the balance showed in the receiver at the begin of a phase of a dose, for a person who has to settle it.
+
+    Attributes:
+        phase: see `actors.interfaces.DoseProgress`.
+        mass: reading without the receiver [kg].
+    """
+
+    KIND = Kind.POUR_READ
+
+    id: int
+    phase: str
+    mass: float
 
 
 @dataclass(frozen=True, kw_only=True)

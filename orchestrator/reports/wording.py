@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from actors.dosing.dose_series import LOST
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory, MemoryFound
 from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan
@@ -18,6 +19,7 @@ from orchestrator.learning.deployment.deployment_result import RiskFound
 from orchestrator.learning.deployment.model_monitoring import DOUBT, Believed
 from orchestrator.learning.deployment.real_pours import PredictionCheck
 from orchestrator.learning.dispense import Dispensed
+from orchestrator.learning.stage_result import entered_by_hand, weighed_masses
 from orchestrator.records.run_record import RunState
 from orchestrator.records.states import State
 from orchestrator.reports import figure_style as style
@@ -39,6 +41,7 @@ from orchestrator.reports.run_summary import (
 )
 from orchestrator.reports.stage_views import SPLITS
 from sim_engine.liquids import Liquid
+from sim_engine.outcome import PourMeasurement
 from sim_engine.prediction_band import PredictionInterval
 from sim_engine.scene import Scene
 from sim_engine.search_space import Axis, Space
@@ -384,14 +387,8 @@ def cost(record: RunState, occupancy: Mapping[str, PoolUse], time_scale: float |
         failed, unknown = sum(p.state == "failed" for p in begun), len(record.unknown_pours)
         lost = "".join(f", {n} {word}" for n, word in ((failed, "failed"), (unknown, "of unknown outcome")) if n)
         costs["pours"] = f"{len(begun)} begun, {len(weighed)} weighed{lost}"
-    if weighed:
-        loaded, spilled, retained = (
-            1e3 * sum(getattr(m, n) for m in weighed) for n in ("loaded", "spilled", "retained")
-        )
-        delivered = loaded - spilled - retained
-        costs["liquid"] = (
-            f"{loaded:.0f} g: {delivered:.0f} g delivered, {spilled:.1f} g spilled, {retained:.1f} g retained"
-        )
+    if liquid := _liquid(record, weighed):
+        costs["liquid"] = liquid
     costs["program at work"] = minutes(record.at_work_s)
     arm = [pour.seconds for pour in begun if pour.seconds]
     if arm:
@@ -403,6 +400,32 @@ def cost(record: RunState, occupancy: Mapping[str, PoolUse], time_scale: float |
         costs["simulations"] = f"{record.simulations}, {minutes(record.cpu_s)} of CPU time{each}"
     pools = {f"pool during pours, {stage.rpartition(':')[2]}": use.text for stage, use in occupancy.items()}
     return costs | {name: text for name, text in pools.items() if text}
+
+
+def _liquid(record: RunState, weighed: Sequence[PourMeasurement]) -> str:
+    """The masses that the pours of a run have moved.
+
+    Of doses, the liquid in the source is no sum of a run: the next dose is poured from the same liquid. What they spill
+    is not weighed, and estimated as in the account of vessels.
+    """
+    if not weighed:
+        return ""
+    masses = [weighed_masses(measured) for measured in weighed]
+    delivered = sum(each.delivered_g or 0.0 for each in masses)
+    if all(pour.request.dose is None for pour in record.pours):
+        loaded, spilled, retained = (
+            sum(getattr(each, name) or 0.0 for each in masses) for name in ("loaded_g", "spilled_g", "retained_g")
+        )
+        return f"{loaded:.0f} g: {delivered:.0f} g delivered, {spilled:.1f} g spilled, {retained:.1f} g retained"
+    text = f"{delivered:.0f} g delivered"
+    if spilled := sum(each.spilled_g or 0.0 for each in masses):
+        text += f", {spilled:.1f} g spilled"
+    unweighed = sum(
+        each.spilled_g is None and not entered_by_hand(pour) for each, pour in zip(masses, weighed, strict=True)
+    )
+    estimate = 1e3 * LOST[0] * unweighed
+    count = f"{unweighed} dose{'' if unweighed == 1 else 's'}"
+    return f"{text}; spilled by {count}: not weighed, {estimate:.0f} g by estimate" if unweighed else text
 
 
 def minutes(seconds: float) -> str:

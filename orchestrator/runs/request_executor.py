@@ -449,7 +449,7 @@ class RequestExecutor:
         if request.proposals is not None:
             if self._ask_operator is None:
                 raise PourNotMadeError(request.question, "; nobody is here to be asked, resuming the run asks again")
-            answer = self._ask_operator(request.question, request.options)
+            answer = self._ask_operator(request.question, request.options, {})
             return Answered(await answer if inspect.isawaitable(answer) else answer)
         if not isinstance(bench := self.bench, Answering):
             raise RequestExecutorError(f"this bench has no operator to ask: {request.question}")

@@ -15,11 +15,14 @@ import re
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from actors.balance.readings import KILOGRAMS
+from actors.balance.readings import KILOGRAMS, typed_weight
+from actors.dosing.dose_series import LOST as LOST_BY_DOSE
+from actors.dosing.dose_series import NINETY_PERCENT
+from actors.interfaces import DoseTarget
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.learning.run_errors import RunError
-from orchestrator.learning.stage_result import ENTERED, StageResult
+from orchestrator.learning.stage_result import DOSE, ENTERED, StageResult
 from orchestrator.learning.strategy import Strategy
 from orchestrator.records.codec import canonical, encode_request, first_difference
 from orchestrator.records.events import (
@@ -29,6 +32,7 @@ from orchestrator.records.events import (
     OperatorAnswered,
     OperatorAsked,
     PourCorrected,
+    PourRead,
     PourWithdrawn,
     Requested,
     RequestFinished,
@@ -40,7 +44,7 @@ from orchestrator.records.events import (
 from orchestrator.records.journal import Journal, JournalReader
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
-from sim_engine.settings.quantity import number_readings, typed_number
+from sim_engine.settings.quantity import number_readings, split_typed, typed_number
 
 
 @dataclass
@@ -55,6 +59,7 @@ class StageHistory:
         finished: the finished requests to the laboratory, and corrections, in the same order.
         pour_attempts: how often each pour was begun.
         withdrawn: pours whose last attempt ended without pouring anything.
+        readings: last mass in the receiver of each dose, as its balance showed it [kg].
         decisions: number of decisions written.
         result: result of a closed stage.
     """
@@ -66,6 +71,7 @@ class StageHistory:
     finished: list[RequestFinished | PourCorrected] = field(default_factory=list)
     pour_attempts: dict[int, int] = field(default_factory=dict)
     withdrawn: set[int] = field(default_factory=set)
+    readings: dict[int, float] = field(default_factory=dict)
     decisions: int = 0
     result: StageResult | None = None
 
@@ -100,6 +106,9 @@ def read_history(journal: JournalReader, stage: str) -> StageHistory:
             case RequestStarted(request=Pour()):
                 history.pour_attempts[event.id] = event.attempt
                 history.withdrawn.discard(event.id)
+                history.readings.pop(event.id, None)
+            case PourRead():
+                history.readings[event.id] = event.mass
             case PourWithdrawn():
                 history.withdrawn.add(event.id)
             case RequestFinished():
@@ -169,10 +178,24 @@ def _check_same(written: Request, now: Request, key: int, stage: str) -> None:
         )
 
 
-AskOperator = Callable[[str, Sequence[str]], str | Awaitable[str]]
-"""Called with a question and the allowed answers; returns one of them. Masses follow the word 'weighed'."""
+Facts = Mapping[str, float | str]
+"""What is known about the subject of a question; the ends of the names are units, such as 'wanted_g'."""
+
+AskOperator = Callable[[str, Sequence[str], Facts], str | Awaitable[str]]
+"""Called with a question, the allowed answers and facts; returns one of the answers. Masses follow the words 'weighed'
+and 'received'."""
 
 LOST, REPEAT, WEIGHED = "lost", "repeat", "weighed SPILLED RETAINED [LOADED]"
+
+RECEIVED = "received MASS [± MASS]"
+"""Answer to the question about a dose: what the cup has received of it."""
+
+LOAD = "load_g"
+"""Fact about an unknown pour: what its source held before [g]."""
+
+ENTERED_DEVIATION = 0.3e-3
+"""Standard deviation of an amount that a person enters without one: two weighings of a cup [kg]."""
+
 _TRIES = 3
 
 LOAD_WITHIN, LOAD_WITHIN_MASS = 0.1, 5e-3
@@ -212,7 +235,7 @@ async def settle_unknown_pours(
         pour = history.requests[key]
         assert isinstance(pour, Pour)
         scene = scenes[pour.scene]
-        subject = f"pour {pour.number} of stage {stage} ({pour.action.display(*_searched(scene, pour))})"
+        subject = _subject(pour, scene, stage)
         if plan.on_unknown == "repeat":
             if not virtual:
                 raise RunError(
@@ -222,9 +245,12 @@ async def settle_unknown_pours(
             text = f"{subject} had begun and has no outcome; it is repeated with the same seed on the virtual bench"
             journal.log("note", text, stage=stage, kept=True)
             continue
-        options = (*((REPEAT,) if virtual else ()), LOST, WEIGHED)
-        question = f"{subject} had begun when the run was interrupted; what was its outcome?"
-        answer, outcome = await _ask(ask, question, options, scene.liquid.mass, on_waiting)
+        options = (*((REPEAT,) if virtual else ()), LOST, WEIGHED if pour.dose is None else RECEIVED)
+        facts = unknown_pour_facts(pour, scene, history.readings.get(key))
+        question = f"{subject} had begun when the run was interrupted; {_to_weigh(facts)}"
+        answer, outcome = await _ask(ask, question, options, facts, on_waiting)
+        if isinstance(outcome, Poured) and pour.dose is not None:
+            outcome = _entered_dose(outcome, pour.dose)
         events: list[Event] = [
             OperatorAsked(stage=stage, id=key, question=question, options=options),
             OperatorAnswered(stage=stage, id=key, answer=answer),
@@ -239,7 +265,8 @@ def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome 
 
     Args:
         answer: 'repeat', 'lost', or 'weighed' with the masses spilled, retained and optionally loaded: in g, or with
-            units. Spaces or semicolons separate them.
+            units. Spaces or semicolons separate them. Of a dose 'received' with the mass in the cup, and after '±' half
+            of its interval with a probability of 90 %.
         options: allowed answers.
         loaded: nominal load of the pourer [kg].
 
@@ -255,6 +282,8 @@ def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome 
     if text == LOST:
         return Failed("pour_unknown", "declared lost by the operator")
     word, _, masses = text.partition(" ")
+    if word == "received" and RECEIVED in options:
+        return _received(answer, masses, loaded)
     if word != "weighed":
         raise ValueError(f"'{answer}' is not an answer; answer with one of: {'; '.join(options)} (masses in grams)")
     try:
@@ -265,6 +294,41 @@ def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome 
 
 
 _BY_OPERATOR = {ENTERED: "weighed by the operator after a restart"}
+
+
+def _received(answer: str, masses: str, loaded: float) -> Poured:
+    """The outcome of a dose whose cup a person has weighed."""
+    amount, stated, half = re.sub(r"\+/?[-−]", "±", masses).partition("±")
+    try:
+        mass, half_interval = (_typed_mass(text) if text else None for text in (amount.strip(), half.strip()))
+        if mass is None or (stated and half_interval is None):
+            raise ValueError("a mass is needed, what the cup has received, e.g. received 4.6 g")
+        if not 0.0 <= mass <= 1.02 * loaded:
+            raise ValueError(f"{1e3 * mass:g} g cannot come from a source that held {1e3 * loaded:g} g")
+    except ValueError as error:
+        raise ValueError(f"'{answer}': {error}") from None
+    deviation = ENTERED_DEVIATION if half_interval is None else half_interval / NINETY_PERCENT
+    about = {"received": mass, "deviation": deviation, "spilled": None}
+    return Poured(PourMeasurement(loaded, 0.0, max(loaded - mass, 0.0), _BY_OPERATOR | {DOSE: about}))
+
+
+def _typed_mass(text: str) -> float:
+    digits, unit = split_typed(text)
+    return typed_weight(text if unit or not digits else f"{text} g").mass
+
+
+def _entered_dose(outcome: Poured, dose: DoseTarget) -> Poured:
+    """The outcome of a dose that a person has entered, with what its source holds now."""
+    measured, source = outcome.measurement, dose.source
+    about = dict(measured.notes.get(DOSE) or {"received": measured.delivered, "spilled": measured.spilled})
+    about |= {"wanted": dose.amount, "end": "entered by hand"}
+    if source is not None:
+        lost = LOST_BY_DOSE[0] if about["spilled"] is None else about["spilled"]
+        spread = math.hypot(source.deviation, about.get("deviation", 0.0), LOST_BY_DOSE[1])
+        about["left"] = [max(source.mass - about["received"] - lost, 0.0), spread]
+    return Poured(replace(measured, notes={**measured.notes, DOSE: about}))
+
+
 _MASS = re.compile(r"([-+−–]?[.,]?[0-9]+(?:[.,'’][0-9]+)*\.?(?:e-?[0-9]+)?)\s*([a-zµ]+)?\s*(?:;|,?(?=\s|$))\s*")
 
 
@@ -342,7 +406,7 @@ def weighed_by_hand(pour: Pour, measured: PourMeasurement) -> str:
 
 
 async def _ask(
-    ask: AskOperator | None, question: str, options: Sequence[str], loaded: float, on_waiting: Callable[[str], None]
+    ask: AskOperator | None, question: str, options: Sequence[str], facts: Facts, on_waiting: Callable[[str], None]
 ) -> tuple[str, Outcome | None]:
     how = f"Resume with one of these answers: {'; '.join(options)} (masses in grams), for example --answer lost"
     if ask is None:
@@ -350,13 +414,64 @@ async def _ask(
     on_waiting(question)
     text = question
     for _ in range(_TRIES):
-        reply = ask(text, options)
+        reply = ask(text, options, facts)
         answer = await reply if inspect.isawaitable(reply) else reply
         try:
-            return answer, parse_answer(answer, options, loaded)
+            return answer, parse_answer(answer, options, 1e-3 * float(facts[LOAD]))
         except ValueError as error:
             text = f"{question}\n{error}"
     raise OperatorNeededError(f"{text}. {how}")
+
+
+def unknown_pour_facts(pour: Pour, scene: Scene, reading: float | None) -> dict[str, float | str]:
+    """What is known about a pour whose outcome is unknown, for the person who weighs it.
+
+    Args:
+        pour: that had begun.
+        scene: of the pour.
+        reading: the last one of the balance in a dose, without the receiver [kg].
+    """
+    dose, source, cup = pour.dose, scene.pourer.name, scene.receiver.name
+    facts: dict[str, float | str] = {"liquid": scene.liquid.name, "from": source, "into": cup}
+    load = scene.liquid.mass
+    if dose is not None:
+        if dose.source is not None:
+            source, load = dose.source.vessel, dose.source.mass
+        facts |= {"from": source, "into": dose.cup or dose.position or cup, "wanted_g": _grams(dose.amount)}
+        if reading is not None:
+            facts["last_reading_g"] = _grams(reading)
+        if dose.held is not None:
+            facts["held_before_g"] = _grams(dose.held)
+    return facts | {LOAD: _grams(load)}
+
+
+def shown_fact(name: str) -> str:
+    """The name of a fact for people: 'wanted [g]'."""
+    return f"{name.removesuffix('_g').replace('_', ' ')} [g]" if name.endswith("_g") else name
+
+
+def _grams(mass: float) -> float:
+    return round(1e3 * mass, 3)
+
+
+def _subject(pour: Pour, scene: Scene, stage: str) -> str:
+    facts = unknown_pour_facts(pour, scene, None)
+    ways = f"{facts['liquid']} from '{facts['from']}' into '{facts['into']}'"
+    if pour.dose is not None:
+        return f"dose {pour.number} of stage {stage}, {facts['wanted_g']:g} g of {ways},"
+    return f"pour {pour.number} of stage {stage} ({pour.action.display(*_searched(scene, pour))}), {ways},"
+
+
+def _to_weigh(facts: Facts) -> str:
+    """What a person has to weigh, and is asked for."""
+    if "wanted_g" not in facts:
+        return (
+            "what was its outcome? Weigh the liquid that was spilled next to the receiver, and the liquid that is left "
+            f"in '{facts['from']}'"
+        )
+    before = facts.get("held_before_g", 0.0)
+    less = f" and without the {before:g} g that it held before" if before else ""
+    return f"what has the cup received? Weigh '{facts['into']}': its content, without the empty cup{less}"
 
 
 def _searched(scene: Scene, pour: Pour) -> tuple[str, ...]:

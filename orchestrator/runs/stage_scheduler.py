@@ -14,6 +14,7 @@ The scheduler does not know how a request is executed (`orchestrator.runs.reques
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from orchestrator.records.events import (
     DecisionMade,
     Event,
     PourProgressed,
+    PourRead,
     PourWithdrawn,
     Requested,
     RequestFinished,
@@ -93,6 +95,9 @@ def next_to_tell(pending_requests: Sequence[PendingRequest]) -> PendingRequest |
     first = min(pending_requests, key=lambda f: (_DELIVERY_ORDER[type(f.request)], f.id), default=None)
     return first if first is not None and first.outcome is not None else None
 
+
+READS = 4
+"""Parts of a wanted amount after which the reading of the balance is written to the journal."""
 
 REPEATS = 3
 """Largest number of times for which a virtual bench is restarted for one pour."""
@@ -251,11 +256,19 @@ class StageScheduler:
             case Simulate():
                 outcome, frames = await self._executor.simulate(request, record=pending.record, started=started)
             case Pour():
+                read_at: tuple[str, int] | None = None
 
                 def progress(p: PourProgress) -> None:
-                    self._journal.append(
+                    nonlocal read_at
+                    events: list[Event] = [
                         PourProgressed(stage=self._stage, id=pending.id, number=request.number, progress=p)
-                    )
+                    ]
+                    if p.dose is not None and p.dose.reading is not None:
+                        step = p.dose.phase, math.floor(READS * p.dose.reading / p.dose.target)
+                        if step != read_at:
+                            read_at, mass = step, p.dose.reading
+                            events.append(PourRead(stage=self._stage, id=pending.id, phase=step[0], mass=mass))
+                    self._journal.append(*events)
 
                 def withdrawn(reason: str) -> None:
                     self._journal.append(PourWithdrawn(stage=self._stage, id=pending.id, reason=reason))

@@ -299,7 +299,7 @@ class MixtureNight:
         resources = RunResources(
             in_process=True,
             laboratory=lambda spec, pours: Attended(spec, self),
-            ask_operator=lambda question, options: "lost",
+            ask_operator=lambda question, options, facts: "lost",
         )
         self.handle = RunService().start(request, resources)
         try:

@@ -238,7 +238,7 @@ class Rig:
         plan = replace(self.plan, outputs=self.plan.outputs.model_copy(update={"directory": str(life.place)}))
         life.directory.mkdir(parents=True, exist_ok=True)
 
-        def answer(question: str, options: Sequence[str]) -> str:
+        def answer(question: str, options: Sequence[str], facts: Any) -> str:
             life.note("asked", question)
             return self.answer(question)
 

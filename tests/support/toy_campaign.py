@@ -333,7 +333,7 @@ def _timeless(data: Any) -> Any:
 
 
 def answering(answer: str) -> Callable[[str, Sequence[str]], str | Awaitable[str]]:
-    return lambda question, options: answer
+    return lambda question, options, facts: answer
 
 
 def main() -> None:

@@ -17,12 +17,12 @@ from actors.interfaces import LaboratoryError
 from actors.interfaces import OperatorQuestion as BenchQuestion
 from orchestrator.daemon.state.daemon_store import QuestionOut, Store
 from orchestrator.learning.mixtures import NO_MORE, parse_proposals
-from orchestrator.runs.resume import parse_answer
+from orchestrator.runs.resume import LOAD, Facts, parse_answer
 
 GIVE_UP = "give up"
 
-LOAD = "load_g"
-"""Detail of a question about an unknown pour: the campaign's load [g]."""
+DIAGNOSTICS = "diagnostics"
+"""Detail of a question about an unknown pour: what arm and balance show now, one finding a line."""
 
 _WORDS = {"done": {"done": "done", "d": "done"}, "yes or no": {"yes": "yes", "y": "yes", "no": "no", "n": "no"}}
 
@@ -179,27 +179,28 @@ class RunQuestions:
     Args:
         asking: asks the questions.
         campaign, rig: subject of the questions.
-        load: load of every pour of the campaign [kg].
         look: reads the arm and the balance for a pour with unknown outcome; may take seconds.
     """
 
     def __init__(
-        self, asking: Asking, store: Store, campaign: str, rig: str, load: float, look: Callable[[], dict[str, str]]
+        self, asking: Asking, store: Store, campaign: str, rig: str, look: Callable[[], dict[str, str]]
     ) -> None:
         self._asking, self._store, self._campaign, self._rig = asking, store, campaign, rig
-        self._load, self._look = load, look
+        self._look = look
 
-    async def __call__(self, text: str, options: Sequence[str]) -> str:
+    async def __call__(self, text: str, options: Sequence[str], facts: Facts) -> str:
         """Ask a question with its options."""
         question, _, problem = text.partition("\n")
         asked = {"campaign": self._campaign, "rig": self._rig, "text": question, "problem": problem, "wants": "option"}
         if options[0] == NO_MORE:
             proposals = {"kind": "mixtures", "about": "mixtures", "options": [NO_MORE], "details": {}, "hands": False}
             return await self._asking.ask(**asked, **proposals)
-        details: dict[str, float | str] = {LOAD: 1e3 * self._load, **await asyncio.to_thread(self._look)}
+        details = dict(facts)
         before = [q for q in self._store.questions(only_open=False, campaign=self._campaign) if q.text == question]
         if before and before[0].answer and not problem:
             details["answered before"] = f"'{before[0].answer}' by {before[0].by}; check whether it was used"
+        found = await asyncio.to_thread(self._look)
+        details[DIAGNOSTICS] = "\n".join(f"{name}: {text}" for name, text in found.items())
         return await self._asking.ask(
             **asked, kind="unknown", about="unknown pour", options=list(options), details=details, hands=False
         )

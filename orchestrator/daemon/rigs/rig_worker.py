@@ -46,7 +46,7 @@ from orchestrator.reports.validity_warnings import not_simulated
 from orchestrator.runs.request_executor import PourUnknownError, RequestExecutorError
 from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService
-from orchestrator.runs.stages import POUR, scenes_of
+from orchestrator.runs.stages import POUR
 
 _log = logging.getLogger(__name__)
 
@@ -263,7 +263,6 @@ class Running:
     def _resources(self, request: RunRequest, checksum: str) -> RunResources:
         asking, key, rig = self._shared.asking, self.item.id, self._rig.name
         plan, live = request.campaign, self._shared.live
-        load = next(iter(scenes_of(plan).values())).liquid.mass  # a campaign has one liquid
         asks = request.pours and plan.laboratory.needs_person
         assert self._progress is not None
 
@@ -276,7 +275,7 @@ class Running:
             ray=self._shared.warm.ray,
             optimizer=self._shared.warm.optimizer(),
             operator=RemoteOperator(asking, key, rig, self._announce) if asks else None,
-            ask_operator=RunQuestions(asking, self._shared.store, key, rig, load, lambda: found_at(plan.laboratory)),
+            ask_operator=RunQuestions(asking, self._shared.store, key, rig, lambda: found_at(plan.laboratory)),
             approved_checksum=checksum,
             subscribers=[
                 self._shared.feed.subscriber(key),

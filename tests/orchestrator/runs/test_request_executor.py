@@ -67,7 +67,7 @@ def test_a_pour_that_broke_off_is_nobody_s_guess(tmp_path):
         resume=True,
         plan=plan,
         stages=one_stage(script),
-        ask_operator=lambda question, options: "weighed 3.1 80.2",
+        ask_operator=lambda question, options, facts: "weighed 3.1 80.2",
     )
     (_, first), (_, second) = script.told
     assert isinstance(first, Poured)

@@ -41,7 +41,7 @@ def test_an_unknown_pour_is_put_to_the_operator(unknown: Callable[[], Path]) -> 
     directory = unknown()
     questions: list[tuple[str, tuple[str, ...]]] = []
 
-    def operator(question: str, options: Any) -> str:
+    def operator(question: str, options: Any, facts: Any) -> str:
         questions.append((question, tuple(options)))
         return ["no idea", "weighed 3.2 g 0.5 g"][len(questions) - 1]
 
@@ -102,7 +102,7 @@ def test_matter_is_not_repeated_on_a_real_bench(tmp_path: Path) -> None:
         run(directory, resume=True, plan=replace(asking(directory, **hardware), on_unknown="repeat"))
     offered: list[tuple[str, ...]] = []
 
-    def operator(question: str, options: Any) -> str:
+    def operator(question: str, options: Any, facts: Any) -> str:
         offered.append(tuple(options))
         return "repeat"
 

@@ -148,7 +148,7 @@ def test_what_never_answers_is_given_up_at_its_deadline(tmp_path: Path) -> None:
         tmp_path / "run",
         resume=True,
         stages=one_stage(weighed),
-        ask_operator=lambda question, options: "weighed 3.0 1.0",
+        ask_operator=lambda question, options, facts: "weighed 3.0 1.0",
     )
     assert [type(outcome) for _, outcome in weighed.told] == [Failed, Poured]
 

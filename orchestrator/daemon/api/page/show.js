@@ -142,16 +142,24 @@ export function questionCard(question, campaign, mode, send) {
     el("p", { class: "quiet" }, modeBadge(mode), ` ${campaign} at ${question.rig}, asked at ${clock(question.asked)}`),
     el("h2", { id: head, tabindex: "-1" }, question.text), problem,
     question.hands ? el("p", { class: "hands" }, "Hands go into the cell: the arm stands still until you answer.") : null,
-    question.about === "vessels_laid_out" ? null : details(question.details), send ? el("div", { class: "answers" }, answers(question, answer)) : el("p", {}, "An operator answers."));
+    question.about === "vessels_laid_out" ? null : details(question.details), send ? el("div", { class: "answers" }, answers(question, answer)) : el("p", {}, "An operator answers."), diagnostics(question));
   if (send && question.kind === "bench") card.append(el("details", {}, el("summary", {}, "This pour can't be made"),
     button(`give-up-${question.id}`, "Give it up", () => answer("give up"), "plain danger")));
   return card;
 }
 
 function details(table) {
-  const rows = Object.entries(table || {}).map(([key, value]) =>
+  const { diagnostics, ...facts } = table || {};
+  const rows = Object.entries(facts).map(([key, value]) =>
     el("div", {}, el("dt", {}, named(key)), el("dd", {}, typeof value === "number" ? String(+value.toPrecision(5)) : String(value))));
   return rows.length ? el("dl", {}, rows) : null;
+}
+
+/** What arm and balance show now, folded: it is long, and answers nothing by itself. */
+function diagnostics(question) {
+  const found = question.details && question.details.diagnostics;
+  return found ? el("details", {}, el("summary", { "data-key": `diagnostics-${question.id}` }, "What arm and balance show now"),
+    el("ul", { class: "quiet" }, found.split("\n").map((line) => el("li", {}, line)))) : null;
 }
 
 /** 'tool_speed_mm_s' → 'tool speed [mm/s]'. */
@@ -167,8 +175,12 @@ function answers(question, answer) {
   if (question.wants === "done") return big("done");
   if (question.wants === "yes or no") return [big("yes"), big("no")];
   if (question.wants === "weight") return weights(question, ["Weight"], ([weight]) => answer(`${weight} g`));
-  return question.options.map((option) => option.startsWith("weighed") ?
-    weights(question, ["Spilled", "Left in the pourer"], (found) => answer(`weighed ${found.map((mass) => `${mass} g`).join("; ")}`)) : big(option));
+  return question.options.map((option) => {
+    if (option.startsWith("received")) return weights(question, ["Received by the cup"], ([mass]) => answer(`received ${mass} g`));
+    if (option.startsWith("weighed")) return weights(question, ["Spilled", "Left in the pourer"],
+      (found) => answer(`weighed ${found.map((mass) => `${mass} g`).join("; ")}`));
+    return big(option);
+  });
 }
 
 function weights(question, names, send) {
