@@ -565,6 +565,40 @@ def _covered_later(measured: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
     return f"{100 * covered:.0f} % ({doses})", str(sum(one["false_stops"] for one in figures))
 
 
+GAPS = {
+    "none, before": "none, before the tilt was bounded",
+    "none": "none",
+    "readings": "readings",
+    "commands": "commands",
+    "both": "readings and commands",
+}
+"""Rows of the gaps in docs/data/dosing-balances.json, and their names."""
+
+
+def dosing_gaps() -> str:
+    """Doses in which readings, commands or both pause; of docs/data/dosing-balances.json."""
+    data = json.loads((FOLDER / "data" / "dosing-balances.json").read_text(encoding="utf-8"))["gaps"]
+    head = ["gap of", "doses", "mean error g", "95 % g", "most above g", "over +1 g", "missed", "false stops", "time s"]
+    rows = [
+        [
+            name,
+            str(one["doses"]),
+            f"{one['mean']:.2f} ({one['mean_interval'][0]:.2f} … {one['mean_interval'][1]:.2f})",
+            f"{one['p95']:.2f}",
+            f"{one['most']:+.2f}",
+            str(one["over"]),
+            str(one["ends"].get("missed", 0)),
+            str(one["false_stops"]),
+            f"{one['time']:.1f}",
+        ]
+        for row, name in GAPS.items()
+        if (one := data.get(row)) is not None
+    ]
+    first, last = data["both"]["seeds"]
+    how = f"two doses of each seed from {first} to {last}"
+    return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing_gaps.py --final --json`; {how}.</sub>\n"
+
+
 def dosing_faults() -> str:
     """Doses of the virtual bench with a fault each."""
     data = json.loads((FOLDER / "data" / "dosing.json").read_text(encoding="utf-8"))["faults"]
@@ -771,6 +805,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "dosing-harder": dosing_harder,
     "dosing-balances": dosing_balances,
     "dosing-pairs": dosing_pairs,
+    "dosing-gaps": dosing_gaps,
     "dosing-faults": dosing_faults,
     "dosing-particles": dosing_particles,
     "command-line": command_line,

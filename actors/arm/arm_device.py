@@ -91,9 +91,10 @@ class DeviceArm:
         executed: Executed = await self.device.call("dose", path, longest, deadline=self._deadline(longest))
         return executed
 
-    async def drive(self, speed: float) -> ArmState:
-        """Set the speed of the tilt in a running dose [rad/s]. Returns the state."""
-        state: ArmState = await self.device.call("drive", speed, deadline=self._patience * DRIVE_TIMEOUT, urgent=True)
+    async def drive(self, speed: float, highest: float, patience: float) -> ArmState:
+        """Set the motion of a running dose until the next call; see `actors.arm.arm_interface.DosingArm`."""
+        deadline = self._patience * DRIVE_TIMEOUT
+        state: ArmState = await self.device.call("drive", speed, highest, patience, deadline=deadline, urgent=True)
         return state
 
     async def retreat(self, path: PlannedPour | PlaceWay, follow: Follow = _ignore) -> None:

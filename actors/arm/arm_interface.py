@@ -298,11 +298,15 @@ class Arm(Protocol):
         ...
 
 
+NEWS_TIMEOUT = 0.2
+"""Longest time without a command after which an arm turns the cup of a dose back by itself [s of bench time]."""
+
+
 class DosingArm(Protocol):
     """An `Arm` that also pours wanted amounts: its tilt is driven while the liquid flows."""
 
     def dose(self, path: Any, longest: float) -> Executed:
-        """Tilt as `drive` says, within the tilt of a checked path; ends upright, without commands for 0.2 s.
+        """Tilt as `drive` says, within the tilt of a checked path; ends upright, when no commands come.
 
         An order to stop turns the cup back upright first; a second one stops the arm where it is.
 
@@ -315,8 +319,17 @@ class DosingArm(Protocol):
         """
         ...
 
-    def drive(self, speed: float) -> ArmState:
-        """Set the speed of the tilt [rad/s] in a running dose, ten to twenty times a second. Returns the state."""
+    def drive(self, speed: float, highest: float, patience: float) -> ArmState:
+        """Set the motion of a running dose until the next call, ten to twenty times a second. Returns the state.
+
+        The arm keeps both limits by itself, in its own cycle, however late the next call is.
+
+        Args:
+            speed: of the tilt [rad/s].
+            highest: tilt at which the arm stops, see `ArmState.tilt`; a larger tilt does not grow [rad].
+            patience: time without a further call after which the cup is turned back; `NEWS_TIMEOUT` at most [s of
+                bench time].
+        """
         ...
 
 

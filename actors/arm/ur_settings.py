@@ -74,8 +74,9 @@ class UrArmSettings(ArmSettings):
     rate: Annotated[float, Quantity("1/s", "125 Hz", 100.0, 500.0)] = 125.0
     """Rate at which the joints are read back."""
 
-    registers: Annotated[int, Strict(), Field(ge=0, le=45), NOT_IN_FINGERPRINT] = 43
-    """First of the three integer inputs of the controller that are written; 0 to 23 are reserved for a fieldbus."""
+    registers: Annotated[int, Strict(), Field(ge=0, le=44), NOT_IN_FINGERPRINT] = 43
+    """First of the three integer inputs of the controller that are written, and of the four double inputs that a dose
+    writes; 0 to 23 are reserved for a fieldbus."""
 
     cell: Annotated[RobotCell, SET_BY_PROGRAM]
     """Objects around the arm: the laboratory's section `cell`."""

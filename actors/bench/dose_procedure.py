@@ -1,8 +1,8 @@
 """One dose on a bench with an arm and a balance under the receiver: steps, consent, control loop, and what was weighed.
 
 The controller (`actors.dosing.dose_controller`) decides the tilt about twenty times a second. The arm's program limits
-it, and turns the cup back by itself without commands for 0.2 s: when this process is killed, pauses, or loses the
-connection.
+it to the largest tilt of the last command, and turns the cup back by itself without commands for 0.2 s at most: when
+this process is killed, pauses, or loses the connection.
 
 1. Fill the source, if requested.
 2. Put the empty receiver on the balance. Its readings show the lag of the balance.
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from actors.arm.arm_device import STUCK
-from actors.arm.arm_interface import ArmState, PlannedPour
+from actors.arm.arm_interface import NEWS_TIMEOUT, ArmState, PlannedPour
 from actors.balance.balance_interface import BalanceError
 from actors.balance.weighing_plan import GRIP, Placement
 from actors.bench.consent import Setup, grams, start_question
@@ -305,17 +305,19 @@ class DoseProcedure(BenchProcedure):
                 await asyncio.sleep(0.01)
             self._readings.fresh()
             begin = self._at = self._now()
-            state = await arm.drive(0.0)
+            state = await arm.drive(0.0, 0.0, NEWS_TIMEOUT)
             upright = state.tilt or 0.0
             while controller.result is None and not motion.done():
                 now = self._now()
                 tilt = (state.tilt or 0.0) - upright
                 self._tilts.append((now - begin, tilt))
                 command = controller.step(now, tilt, self._readings.fresh())
-                state = await arm.drive(command.speed)
+                state = await arm.drive(command.speed, upright + command.highest, command.patience)
                 clock.promise("dose", LATEST_COMMAND)
                 self._show(controller, state, tilt)
                 await self._sleep(max(now + TICK - self._now(), 0.0))
+                if self._now() - now > 1.5 * TICK:  # this process paused, and the arm moved on
+                    state = await arm.state()
             clock.withdraw("dose")
             self._executed = await motion  # without commands the cup turns back, and the program ends
         finally:

@@ -33,6 +33,7 @@ import pytest
 from numpy.typing import NDArray
 
 from actors.arm.arm_interface import (
+    NEWS_TIMEOUT,
     Arm,
     ArmError,
     ArmLostError,
@@ -246,6 +247,33 @@ class ArmContract:
             f"state() shows a tilt of {_deg(largest)} at most; the plan tilts by {_deg(bench.path.report.tilt)}"
         )
         self._states_keep_to_speeds(bench, moving)
+
+    def test_a_dose_keeps_to_its_last_command_by_itself(self, bench: ArmBench) -> None:
+        """However late the next command is, the tilt does not pass the largest one, and the cup comes back upright."""
+        arm: Any = bench.arm
+        if not hasattr(arm, "dose"):
+            pytest.skip("it pours no wanted amounts (DosingArm)")
+        self._to_start(bench)
+        dosing = Call(arm.dose, bench.path, EVENT_TIMEOUT * bench.time_scale)
+        self._await(bench, lambda: arm.state().phase == "dose" or not dosing.is_alive(), "no dose begins")
+        upright, began = arm.state().tilt, self._true_time(bench)
+        highest = upright + 0.3 * bench.path.report.tilt
+        end = time.monotonic() + EVENT_TIMEOUT
+        # a command that would pass the largest tilt before the arm turns back by itself
+        while arm.drive(bench.path.report.tilt_speed, highest, NEWS_TIMEOUT).tilt < highest - CLOSE:
+            assert dosing.is_alive(), f"the dose {_ended_with(dosing.ended())} while commands came"
+            assert time.monotonic() < end, "the arm does not tilt as drive() says"
+        seen = []
+        while dosing.is_alive():
+            seen.append(arm.state().tilt)
+            time.sleep(0.005)
+        assert dosing.ended() is None
+        if bench.true_poses is not None:
+            seen += [_tilt(pose) for pose in self._seen(bench, began)[1]]
+            assert _tilt(self._rest(bench)) < upright + CLOSE, "without commands the cup does not come back upright"
+        assert max(seen) < highest + CLOSE, (
+            f"a dose tilts by {_deg(max(seen))} while no command comes; the last one said {_deg(highest)} at most"
+        )
 
     def test_it_does_one_thing_at_a_time(self, bench: ArmBench) -> None:
         """A second motion is refused, and the first one continues."""

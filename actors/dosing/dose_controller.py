@@ -27,6 +27,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from actors.arm.arm_interface import NEWS_TIMEOUT
 from actors.balance.display_quality import FLOW_ERROR, dose_tolerance
 from actors.dosing.cup_flow import LARGEST_TILT, CupFlow, Floats, median, quantile
 from actors.dosing.display_belief import REPEATS, DisplayBelief
@@ -139,8 +140,26 @@ PARK = math.radians(18.0)
 SEEN = 0.25e-3
 """Smallest rise of the reading that counts as the stream [kg]."""
 
-ARM_PATIENCE = 0.2
-"""Time without a command after which the arm turns back by itself [s]."""
+LONG_PAUSE, FLOWED = 0.3, 0.05e-3
+"""Time without a decision after which the cup is turned back and weighed [s], if that much may have flowed [kg]."""
+
+LATE_COMMAND = (1.3, 0.02)
+"""Shortest such time that a command may set: intervals between commands, and [s]."""
+
+AHEAD = 3.0
+"""Intervals between commands by which the largest tilt of a command lies ahead."""
+
+LATE_READING = (1.6, 1.2, 2.5)
+"""Time without a reading after which the largest tilt does not rise, in the manner of `SILENCE`."""
+
+TOGETHER = 0.4
+"""Readings that arrive within this part of their usual interval were held up, all but the last one."""
+
+UNREPORTED = 0.3
+"""Time after which the cup is turned back if the arm, which should move, reports one and the same tilt [s]."""
+
+SURELY = 3.0
+"""Standard deviations within which a dose that gets no further command stays within its tolerance."""
 
 LATEST_ONSET = math.radians(1.5)
 """Tilt by which outflow can begin later than expected, even after many doses: the lip may have dried [rad]."""
@@ -230,10 +249,14 @@ class TiltCommand:
 
     Attributes:
         speed: of the tilt, positive towards the receiver [rad/s].
+        highest: tilt at which the arm stops by itself until the next command; a tilt above it does not grow [rad].
+        patience: time without a further command after which the arm turns back by itself [s].
         finished: the dose is over; the arm returns upright.
     """
 
     speed: float
+    highest: float = math.inf
+    patience: float = NEWS_TIMEOUT
     finished: bool = False
 
 
@@ -285,7 +308,7 @@ class DoseController:
         self._begin: float | None = None
         self._zero: float | None = None
         self._recent: list[DoseReading] = []
-        self._now, self._tilt, self._speed = 0.0, 0.0, 0.0
+        self._now, self._tilt, self._command = 0.0, 0.0, TiltCommand(0.0, 0.0)
         self._rising = 0
         self._innovations: list[float] = []
         self._tick = 0.05
@@ -297,11 +320,12 @@ class DoseController:
         self._end: DoseEnd | None = None
         self._top_ups = self._pauses = 0
         self._suspected: DoseEnd | None = None
-        self._paused = False
+        self._paused = self._doubted = False
         self._remainder = step / math.sqrt(12.0)
         self._interval, self._longest_gap = belief.display.interval, belief.display.longest
         self._before_silence: float | None = None
-        self._unchanged_since = 0.0
+        self._unchanged_since, self._onset = 0.0, 0.0
+        self._reported = self._reported_at = -math.inf
         self._tared, self._tracked, self._late_drops = False, 0.0, _late_drops(RUN_OFF)
         self._factor_before = median(belief.flow_factor)
         self._idle_since: float | None = None
@@ -344,8 +368,12 @@ class DoseController:
         if self._begin is None:
             self._begin = self._now = time
             self._estimator.start(time, tilt)
-        paused = time - self._now > 0.3 and self.phase in (DosePhase.APPROACH, DosePhase.POUR)
-        if paused:
+        tilt = self._followed(time, tilt)
+        readings = self._in_time(readings)
+        pours = self.phase in (DosePhase.APPROACH, DosePhase.POUR)
+        turned = pours and time - self._now > self._command.patience + self._settings.latency
+        paused = turned and time - self._now > LONG_PAUSE
+        if turned:
             self._pass_over(time, tilt)
             self._recent = [*self._recent, *readings][-40:]
         else:
@@ -359,8 +387,9 @@ class DoseController:
         self._note_tracking(time - self._now)
         self._tick += 0.2 * (min(time - self._now, 0.2) - self._tick)
         self._now, self._tilt = time, tilt
-        if paused and tilt > 0.0:
+        if paused and tilt > 0.0 and self.amount[0] > FLOWED:
             self._turn_back()  # the arm has turned back by itself
+            self._paused, self._doubted = True, False
         self._watch()
         decide = {
             DosePhase.CHECK: self._check,
@@ -369,9 +398,78 @@ class DoseController:
             DosePhase.RETURN: self._return,
             DosePhase.SETTLE: self._settle,
         }.get(self.phase)
-        speed = 0.0 if decide is None else decide()
-        self._speed = speed
-        return TiltCommand(speed, self.phase is DosePhase.DONE)
+        self._command = self._bounded(0.0 if decide is None else decide())
+        return self._command
+
+    def _bounded(self, speed: float) -> TiltCommand:
+        """The command of a speed [rad/s], with what the arm may do if no further one follows."""
+        if self.phase not in (DosePhase.APPROACH, DosePhase.POUR, DosePhase.RETURN):
+            return TiltCommand(speed, 0.0, finished=self.phase is DosePhase.DONE)
+        ahead = self._ahead
+        highest = ahead + max(speed, 0.0) * AHEAD * self._tick
+        if self.phase is DosePhase.APPROACH and ahead < self._onset:
+            highest = self._onset
+        if self.phase is DosePhase.RETURN or self._overdue() > 0.0:
+            highest = min(highest, self._command.highest)
+        return TiltCommand(speed, highest, self._patience_of(speed, highest))
+
+    def _followed(self, time: float, reported: float) -> float:
+        """The tilt now [rad]; if the report is an old one, as the last command moves the arm."""
+        speed, before = self._command.speed, self._reported
+        if reported != before or speed == 0.0:
+            self._reported, self._reported_at = reported, time
+            return reported
+        if reported <= 0.0 or self.phase not in (DosePhase.APPROACH, DosePhase.POUR, DosePhase.RETURN):
+            return reported
+        moved = self._tilt + speed * min(time - self._now, self._command.patience)
+        return max(min(moved, max(self._command.highest, self._tilt)), 0.0)
+
+    def _in_time(self, readings: Sequence[DoseReading]) -> list[DoseReading]:
+        """The readings without those that were held up and arrived together with a later one."""
+        least = TOGETHER * self._interval
+        return [
+            reading
+            for reading, after in itertools.zip_longest(readings, readings[1:])
+            if after is None or after.time - reading.time >= least
+        ]
+
+    @property
+    def _ahead(self) -> float:
+        """Tilt when the arm begins to follow the next command [rad]."""
+        speed, highest = self._command.speed, self._command.highest
+        ahead = self._tilt + speed * self._settings.latency
+        return max(min(ahead, highest), self._tilt) if speed > 0.0 else ahead
+
+    def _patience_of(self, speed: float, highest: float) -> float:
+        """The longest time without a command after which the dose still stays within its tolerance [s]."""
+        e, s = self._estimator, self._settings
+        factor, more = LATE_COMMAND
+        least = min(factor * self._tick + more, NEWS_TIMEOUT)
+        if self._order.amount - float(e.mass.max()) > 2.5 * self._cup.density * float(e.flow.max()) + 3e-3:
+            return NEWS_TIMEOUT
+        for patience in np.linspace(NEWS_TIMEOUT, least, 4)[:-1]:
+            final = e.final_mass(
+                self._tilt,
+                speed,
+                latency=s.latency + float(patience),
+                back=s.return_speed,
+                acceleration=s.acceleration,
+                highest=highest,
+            )
+            surely = median(final) + SURELY * self._spread(final)
+            if surely < self._order.amount + self._order.limit:
+                return float(patience)
+        return least
+
+    def _spread(self, final: Floats) -> float:
+        """Standard deviation of final amounts [kg], with what flowed unseen since a reading was due."""
+        unseen = FLOW_ERROR * self.flow * self._overdue()
+        return math.hypot(float(final.std()), 0.1e-3, unseen)
+
+    def _overdue(self) -> float:
+        """Time by which the last reading is older than is usual [s]; 0 if it is not."""
+        age = self._now - self._recent[-1].time if self._recent else 0.0
+        return max(age - self._usual(*LATE_READING) - self._tick, 0.0)
 
     def _check(self) -> float:
         """Wait for a balance at rest, and take its reading as the zero."""
@@ -395,7 +493,8 @@ class DoseController:
     def _approach(self) -> float:
         e = self._estimator
         early = quantile(self._cup.tilt_for(e.volume, np.zeros_like(e.volume)) + e.onset_bias, 0.03)
-        ahead = self._tilt + self._speed * self._settings.latency
+        self._onset = early
+        ahead = self._ahead
         if self._rising >= 2:
             self._enter(DosePhase.POUR)
             return self._pour()
@@ -424,7 +523,7 @@ class DoseController:
         )
         # Feedforward θ' = q / (−dV/dθ), which keeps the head, plus feedback 4/s · (aim − θ), θ predicted by the latency
         feed = wanted / self._cup.density / self._cup.volume_per_tilt(volume, head)
-        ahead = self._tilt + self._speed * self._settings.latency
+        ahead = self._ahead
         speed = feed + 4.0 * (aim - ahead)
         highest = 0.0 if self._doubt_since is not None else math.radians(15.0)
         if ahead >= LARGEST_TILT - math.radians(5.0):
@@ -520,10 +619,11 @@ class DoseController:
             if paused < (MOST_PAUSES if self._paused else self._settings.most_top_ups):
                 self._pauses += self._paused
                 self._top_ups += not self._paused
-                if self._paused:
+                if self._doubted:
                     self._estimator.loosen()
                 self._estimator.update(DoseReading(self._now, amount), sigma=max(0.05e-3, self.deviation))
                 self._rising, self._doubt_since, self._suspected, self._paused = 0, None, None, False
+                self._doubted = False
                 self._unchanged_since, self._estimator.repeats.run = self._now, 0.0
                 self._late_mass = amount
                 self._enter(DosePhase.APPROACH)
@@ -562,11 +662,14 @@ class DoseController:
         """Whether no reading has come for longer than is usual."""
         if not self._recent:
             return True
+        longest = max(self._usual(*SILENCE), self._settings.reading_timeout)
+        return self._now - self._recent[-1].time > longest
+
+    def _usual(self, least: float, longer: float, most: float) -> float:
+        """A time between two readings from the usual and from the longest one, see `SILENCE` [s]."""
         gaps = [after.time - before.time for before, after in itertools.pairwise(self._recent[-6:])]
         usual = max(self._interval, statistics.median(gaps)) if gaps else self._interval
-        least, longer, most = SILENCE
-        limit = min(max(least * usual, longer * self._longest_gap), most * usual)
-        return self._now - self._recent[-1].time > max(limit, self._settings.reading_timeout)
+        return min(max(least * usual, longer * self._longest_gap), most * usual)
 
     def _blind(self) -> float:
         """Time for which the display may repeat one reading, which hardly one in ten repeats exceeds [s]."""
@@ -613,10 +716,14 @@ class DoseController:
         if order.amount - float(e.mass.max()) > 1.5 * self._cup.density * float(e.flow.max()) + 1e-3:
             return False
         final = e.final_mass(
-            self._tilt, self._speed, latency=s.latency, back=s.return_speed, acceleration=self._return_acceleration()
+            self._tilt,
+            self._command.speed,
+            latency=s.latency,
+            back=s.return_speed,
+            acceleration=self._return_acceleration(),
         )
         # Return if median ≥ target, or P(final > target + limit) > 1 %: median + 2.33 σ ≥ target + limit
-        middle, deviation = median(final) + self._aim(), math.hypot(float(final.std()), 0.1e-3)
+        middle, deviation = median(final) + self._aim(), self._spread(final)
         left, wait = order.amount - middle, 0.0
         if middle + 2.33 * deviation < order.amount + order.limit:
             wait = max(left, 0.0) / max(self.flow, 1e-6)
@@ -676,8 +783,9 @@ class DoseController:
 
     def _pass_over(self, time: float, tilt: float) -> None:
         """Move the particles over a pause of the caller, in which the arm has turned back by itself."""
-        highest = self._tilt + self._speed * ARM_PATIENCE
-        turned = self._now + ARM_PATIENCE
+        last = self._command
+        highest = min(self._tilt + last.speed * last.patience, max(last.highest, self._tilt))
+        turned = self._now + last.patience
         self._estimator.advance(min(turned, time), highest)
         self._estimator.advance(min(turned + abs(highest - tilt) / self._settings.return_speed, time), tilt)
 
@@ -709,6 +817,8 @@ class DoseController:
         if self._silent():
             self._before_silence = net
             self._pause()
+        elif self._tilt > 0.0 and self._now - self._reported_at > UNREPORTED:
+            self._pause()
         elif self._now - self._begin > s.time_limit:
             self._turn_back(DoseEnd.TIME_LIMIT)
         elif self._doubt_since is not None and self._now - self._doubt_since > self._patience(LONGEST_DOUBT):
@@ -739,7 +849,7 @@ class DoseController:
 
     def _pause(self, suspected: DoseEnd | None = None) -> None:
         """Turn back and weigh, because the readings do not follow the stream; the weight decides whether it missed."""
-        self._suspected, self._paused = suspected, True
+        self._suspected, self._paused, self._doubted = suspected, True, True
         self._turn_back()
 
     def _rate(self) -> float:
@@ -759,7 +869,7 @@ class DoseController:
     def _turn_back(self, end: DoseEnd | None = None, *, wait: float = 0.0, gently: bool = False) -> None:
         self._end = self._end or end
         self._stop_tilt = self._tilt
-        self._ramp_begin, self._ramp_speed = self._now + wait, self._speed
+        self._ramp_begin, self._ramp_speed = self._now + wait, self._command.speed
         self._ramp = self._return_acceleration() if gently else self._settings.acceleration
         self._enter(DosePhase.RETURN)
 

@@ -536,7 +536,16 @@ class DoseEstimator:
         self.onset_bias = self.onset_bias + math.radians(0.6) * _even_normal(count, self._rng)
         self.flow_factor = np.clip(self.flow_factor * np.exp(0.1 * _even_normal(count, self._rng)), *FACTOR_RANGE)
 
-    def final_mass(self, tilt: float, speed: float, *, latency: float, back: float, acceleration: float) -> Floats:
+    def final_mass(
+        self,
+        tilt: float,
+        speed: float,
+        *,
+        latency: float,
+        back: float,
+        acceleration: float,
+        highest: float = math.inf,
+    ) -> Floats:
         """Mass past the lip after a return that is ordered now (N,) [kg].
 
         Args:
@@ -545,6 +554,7 @@ class DoseEstimator:
             latency: until the arm begins to follow the order [s].
             back: speed of the return, positive [rad/s].
             acceleration: of the return [rad/s²].
+            highest: tilt at which the arm stops until then [rad].
         """
         # The same V' = −q, m' = ρq without noise, while the tilt's speed falls with the acceleration to −back
         volume, total = self.volume.copy(), self.mass.copy()
@@ -552,9 +562,9 @@ class DoseEstimator:
         while elapsed < latency + 0.6:
             if elapsed >= latency:
                 speed = max(speed - acceleration * dt, -back)
-            tilt += speed * dt
+            tilt = max(min(tilt + speed * dt, highest), tilt + min(speed, 0.0) * dt)
             head = self.cup.head(volume, tilt - self.onset_bias)
-            if head.max() <= 0.0:
+            if head.max() <= 0.0 and elapsed >= latency:
                 break
             flow = np.where(head > 0.0, self.flow_factor * self.cup.flow(head, tilt), 0.0)
             volume -= flow * dt

@@ -12,7 +12,7 @@ not the model of `actors.dosing.dose_estimator`:
 | stream | falls from a height that changes, with initial speed, spread in time; its impact fluctuates |
 | balance | first order, Butterworth of fourth order, moving average, switching lag; delay, display, noise; the |
 |   | behaviours of real displays: `actors.balance.display_behaviour` |
-| arm | commands at 10 or 20 Hz; limits of speed and acceleration, servo lag; back after 0.2 s without news |
+| arm | commands at 10 or 20 Hz; limits of speed, acceleration and tilt, servo lag; back without news |
 
 `DosingFault` disturbs a dose. Every dose is deterministic for a seed.
 
@@ -31,6 +31,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.arm.arm_interface import NEWS_TIMEOUT
 from actors.balance.display_behaviour import IDEAL, DisplayBehaviour, DisplayModel
 from actors.dosing.dose_controller import TiltCommand
 from actors.dosing.dose_estimator import DoseReading
@@ -42,9 +43,6 @@ Floats = NDArray[np.float64]
 TIME_STEP = 0.005
 """[s]"""
 
-WATCHDOG = 0.2
-"""Time without a fresh command after which the arm tilts back by itself [s]."""
-
 LONGEST_DOSE = 90.0
 """[s]"""
 
@@ -52,13 +50,16 @@ LONGEST_DOSE = 90.0
 class Doser(Protocol):
     """Anything that decides the tilt of one dose."""
 
-    def step(self, time: float, tilt: float, readings: Sequence[DoseReading]) -> TiltCommand:
+    def step(self, time: float, tilt: float, readings: Sequence[DoseReading]) -> TiltCommand | None:
         """Decide.
 
         Args:
             time: now [s].
             tilt: measured now [rad].
             readings: that arrived since the last call.
+
+        Returns:
+            The command; None if none reaches the arm.
         """
         ...
 
@@ -346,8 +347,8 @@ class VirtualDosingBench:
         base = 0.0 if missing else self.receiver_mass
         cell, shown = _Filter(scale, base), self._display(base, zero=self.tare)
         drops = int(rng.integers(0, 4))
-        tilt = target = speed = ordered = 0.0
-        fresh, pending = 0.0, deque[tuple[float, float]]()
+        tilt = target = speed = 0.0
+        ordered, fresh, pending = TiltCommand(0.0), 0.0, deque[tuple[float, TiltCommand]]()
         pending_readings: deque[DoseReading] = deque()
         next_call, next_reading = 0.0, float(rng.uniform(0.0, scale.interval))
         finished_at, upright = math.inf, 0.0
@@ -369,16 +370,19 @@ class VirtualDosingBench:
                     arrived.append(pending_readings.popleft())
                 delivered += arrived
                 command = doser.step(time, tilt, arrived)
-                pending.append((time + self._network, command.speed))
-                if command.finished:
-                    finished_at = time
+                if command is not None:
+                    pending.append((time + self._network, command))
+                    if command.finished:
+                        finished_at = time
             while pending and pending[0][0] <= time:
                 _, ordered = pending.popleft()
                 fresh = time
-            lost = time - fresh > WATCHDOG
+            lost = time - fresh > min(ordered.patience, NEWS_TIMEOUT)
             if lost and fault is not None and fault.kind == "killed" and tilt < 1e-4 and pour.first_flow < math.inf:
                 finished_at = min(finished_at, time)
-            wanted = -math.radians(60.0) if lost or finished_at < math.inf else min(max(ordered, -limit), limit)
+            wanted = -math.radians(60.0) if lost or finished_at < math.inf else min(max(ordered.speed, -limit), limit)
+            # v = √(2 a left): the speed from which the arm still stops at the command's largest tilt
+            wanted = min(wanted, math.sqrt(2.0 * acceleration * max(ordered.highest - target, 0.0)))
             before = speed
             speed += min(max(wanted - speed, -acceleration * dt), acceleration * dt)
             target += speed * dt

@@ -33,6 +33,7 @@ from actors.arm.ur.worker_messages import (
     MotionOutcome,
     MotionProgress,
     Sample,
+    TiltOrder,
     TroubleError,
     may_move,
     safety_mode,
@@ -121,10 +122,10 @@ class MotionMonitor:
         if not self._motion.tilts or again or not self._went:
             self._client.order_stop(self._motion.number)
 
-    def tilt(self, speed: float) -> None:
-        """Pass on a wanted speed of the tilt [rad/s]; may be called from any thread."""
+    def tilt(self, order: TiltOrder) -> None:
+        """Pass on an order of a dose; may be called from any thread."""
         if self._motion.tilts and self._went and not self._ordered.is_set():
-            self._client.tilt(speed)
+            self._client.tilt(order)
 
     def run(self) -> MotionOutcome:
         """Execute the whole motion.

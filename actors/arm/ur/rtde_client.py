@@ -29,9 +29,12 @@ from actors.arm.ur.worker_messages import (
     STATUS,
     STOP_ORDER,
     TILT_COUNTER,
+    TILT_HIGHEST,
+    TILT_PATIENCE,
     TILT_SPEED,
     TOOL,
     DataPackage,
+    TiltOrder,
     TroubleError,
 )
 from actors.runtime.bench_clock import DeviceClock
@@ -53,7 +56,7 @@ AT_REST = 8.0
 ORDERS = ((STOP_ORDER,), (HEARTBEAT,), (GO,))
 """Integer inputs, each written alone."""
 
-TILT_INPUTS = ((TILT_SPEED, TILT_COUNTER),)
+TILT_INPUTS = ((TILT_SPEED, TILT_COUNTER, TILT_HIGHEST, TILT_PATIENCE),)
 """Double inputs of a dose, written together."""
 
 _SAME_READINGS = 10
@@ -192,11 +195,11 @@ class RtdeClient:
         if self._tilt is None:
             self._tilt = InputWriter(self._address, self._registers, TILT_INPUTS, "DOUBLE", self._timeout)
 
-    def tilt(self, speed: float) -> None:
-        """Write the wanted speed of the tilt [rad/s] with a new counter, in one package."""
+    def tilt(self, order: TiltOrder) -> None:
+        """Write an order of a dose with a new counter, in one package."""
         if self._tilt is not None:
             self._commands += 1
-            self._tilt.write(TILT_SPEED, speed, float(self._commands))
+            self._tilt.write(TILT_SPEED, order.speed, float(self._commands), order.highest, order.patience)
 
 
 def has_library() -> bool:

@@ -37,7 +37,14 @@ from actors.arm.ur.motion_segments import MotionSegment, jog_path, upright_way, 
 from actors.arm.ur.robot_comparison import payload_check
 from actors.arm.ur.ur_session import ANSWER_TIME, Session, UrFacts
 from actors.arm.ur.urscript_writer import TiltLimits, path_program, tilt_program
-from actors.arm.ur.worker_messages import REDUCED, DataPackage, MotionOrder, MotionOutcome, MotionSettings
+from actors.arm.ur.worker_messages import (
+    REDUCED,
+    DataPackage,
+    MotionOrder,
+    MotionOutcome,
+    MotionSettings,
+    TiltOrder,
+)
 from actors.arm.ur_settings import UrArmSettings
 from actors.arm_geometry import Joints, Pose
 from actors.interfaces import LaboratoryError
@@ -219,9 +226,11 @@ class UrArm:
             finally:
                 self._tilting = None
 
-    def drive(self, speed: float) -> ArmState:
+    def drive(self, speed: float, highest: float, patience: float) -> ArmState:
         """See `DosingArm.drive`."""
-        self._session.tilt(speed)
+        if (tilting := self._tilting) is not None:
+            first, last = float(tilting.tilts[0]), float(tilting.tilts[-1])
+            self._session.tilt(TiltOrder(speed, min(max(highest, first), last) - first, patience))
         return self.state()
 
     def retreat(self, path: PourPath | PlaceWay) -> None:

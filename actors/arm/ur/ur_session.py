@@ -27,6 +27,7 @@ from actors.arm.ur.worker_messages import (
     SILENCE,
     Facts,
     MotionProgress,
+    TiltOrder,
     TroubleError,
     safety_mode,
     why_not_ready,
@@ -174,9 +175,9 @@ class WorkerProcess:
         """Order a stop of any motion; does not wait."""
         self._send(("stop", stops))
 
-    def tilt(self, speed: float) -> None:
-        """Send the wanted speed of the tilt in a dose [rad/s]; does not wait."""
-        self._send(("tilt", speed))
+    def tilt(self, order: TiltOrder) -> None:
+        """Send an order of a dose; does not wait."""
+        self._send(("tilt", order))
 
     def kill(self) -> None:
         """End the process; its watchdog ends a running motion."""
@@ -297,10 +298,10 @@ class Session:
         if self._worker is not None:
             self._worker.stop(stops)
 
-    def tilt(self, speed: float) -> None:
-        """Send the wanted speed of the tilt in a dose [rad/s]; does not wait."""
+    def tilt(self, order: TiltOrder) -> None:
+        """Send an order of a dose; does not wait."""
         if self._worker is not None:
-            self._worker.tilt(speed)
+            self._worker.tilt(order)
 
     def kill(self) -> None:
         """End the worker; its watchdog ends a running motion."""

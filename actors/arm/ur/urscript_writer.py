@@ -9,7 +9,7 @@ Targets streamed from this machine would jitter with its load; a program on the 
 - reports its progress.
 
 `path_program` runs a path on its own schedule. `tilt_program` runs along a path at the speed that this machine writes
-10 to 20 times a second; without news it turns the cup back.
+10 to 20 times a second, up to the tilt that it writes; without news it turns the cup back.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from actors.arm.arm_interface import ArmRefusedError
+from actors.arm.arm_interface import NEWS_TIMEOUT, ArmRefusedError
 from actors.arm.planned_pour import FloatArray, JointPath
 from actors.arm.ur.worker_messages import (
     CLOCK,
@@ -33,6 +33,8 @@ from actors.arm.ur.worker_messages import (
     STOP_ORDER,
     STOPPED,
     TILT_COUNTER,
+    TILT_HIGHEST,
+    TILT_PATIENCE,
     TILT_SPEED,
     TOOL,
     MotionSettings,
@@ -52,8 +54,8 @@ THINNING = 1e-5
 
 MOST_POINTS = 1_800
 
-NEWS_TIMEOUT, FIRST_NEWS_TIMEOUT = 0.2, 2.0
-"""Time without a new command after which a dose's program turns the cup back, and the same before the first [s]."""
+FIRST_NEWS_TIMEOUT = 2.0
+"""Time without a command after which a dose's program turns the cup back before the first one [s]."""
 
 END_TIMEOUT = 1.5
 """Time without a command after which the program of a dose ends, if the cup is upright [s of controller time]."""
@@ -176,8 +178,9 @@ def tilt_program(
 ) -> str:
     """A program that tilts the pourer at the speed in a register, within a checked range of tilts.
 
-    A client writes the speed to `TILT_SPEED` and then changes `TILT_COUNTER`. If the counter does not change for
-    `NEWS_TIMEOUT`, the program turns the cup back: a tilted cup that stands still pours on. An upright cup waits for
+    A client writes a `TiltOrder` to its inputs and changes `TILT_COUNTER`. The program stops at the order's largest
+    tilt by itself. If the counter does not change for the order's patience, `NEWS_TIMEOUT` at most, the program
+    turns the cup back: a tilted cup that stands still pours on. An upright cup waits for
     `END_TIMEOUT`, so that a computer that paused can pour on; then the program ends. A dose ends in the same way, by
     silence. The heartbeat's watchdog of `path_program` would stop the arm where it is, so this program
     has none. An order to stop still stops the arm at once.
@@ -226,13 +229,16 @@ def tilt_program(
             "      d_silence = d_silence + d_step",
             "    end",
             f"    local d_wanted = read_input_float_register({settings.registers + TILT_SPEED})",
-            f"    if d_silence >= {NEWS_TIMEOUT}:",
+            f"    local d_patience = read_input_float_register({settings.registers + TILT_PATIENCE})",
+            f"    if d_silence >= d_clip(d_patience, 0.0, {NEWS_TIMEOUT}):",
             f"      d_wanted = -{limits.speed:.6f}",
             "    elif d_silence < 0.0:",
             "      d_wanted = 0.0",
             "    end",
-            # the speed from which the arm can still stop within the range
-            f"    local d_up = sqrt({2.0 * limits.acceleration:.6f} * ({end:.6f} - d_tilt))",
+            # the speed from which the arm can still stop at the order's largest tilt, within the range
+            f"    local d_highest = read_input_float_register({settings.registers + TILT_HIGHEST})",
+            f"    local d_left = d_clip(d_clip(d_highest, 0.0, {end:.6f}) - d_tilt, 0.0, {end:.6f})",
+            f"    local d_up = sqrt({2.0 * limits.acceleration:.6f} * d_left)",
             f"    local d_down = sqrt({2.0 * limits.acceleration:.6f} * d_tilt)",
             f"    d_wanted = d_clip(d_wanted, -d_clip(d_down, 0.0, {limits.speed:.6f}), "
             f"d_clip(d_up, 0.0, {limits.speed:.6f}))",

@@ -15,9 +15,8 @@ STOP_ORDER, HEARTBEAT, GO = 0, 1, 2
 """Integer inputs, counted from the arm's setting `registers`. An order is the number of its motion, so that an old
 order has no effect."""
 
-TILT_SPEED, TILT_COUNTER = 0, 1
-"""Double inputs of a dose, counted from the same setting: the wanted speed [rad/s]; a number that changes with each
-command."""
+TILT_SPEED, TILT_COUNTER, TILT_HIGHEST, TILT_PATIENCE = 0, 1, 2, 3
+"""Double inputs of a dose, counted from the same setting: a `TiltOrder`, and a number that changes with each one."""
 
 NUMBER, STATUS = 12, 13
 """Integer outputs: the number of the motion whose program runs, and its status."""
@@ -173,13 +172,28 @@ class MotionSettings:
     Attributes:
         tool: TCP in the flange's frame [m], [rad].
         payload: [kg]; `centre` [m].
-        registers: first of the three integer inputs that are written, and of the two double inputs of a dose.
+        registers: first of the three integer inputs that are written, and of the four double inputs of a dose.
     """
 
     tool: tuple[float, ...]
     payload: float
     centre: tuple[float, ...]
     registers: int
+
+
+@dataclass(frozen=True)
+class TiltOrder:
+    """What a dose's program does until the next order.
+
+    Attributes:
+        speed: of the tilt [rad/s].
+        highest: tilt from upright at which it stops [rad].
+        patience: time without an order after which it turns the cup back [s of controller time].
+    """
+
+    speed: float
+    highest: float
+    patience: float
 
 
 @dataclass(frozen=True)
@@ -194,7 +208,7 @@ class MotionOrder:
         settings: read back before the start.
         stops: number of stops when the motion was requested; if there is another one, it does not start.
         pours: it carries or pours liquid, so it needs the normal limits and the full speed.
-        tilts: it is a dose, whose speed comes over registers. Without news it ends by itself, upright; the first order
+        tilts: it is a dose, whose orders come over registers. Without news it ends by itself, upright; the first order
             to stop ends it in this way.
     """
 

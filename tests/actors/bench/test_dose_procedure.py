@@ -342,8 +342,8 @@ arm.release()
 arm.move_to_start(path)
 threading.Thread(target=arm.dose, args=(path, 60.0), daemon=True).start()
 while True:
-    tilt = arm.drive(0.0).tilt or 0.0
-    arm.drive(1.5 if tilt < 1.1 else 0.02)
+    tilt = arm.drive(0.0, 9.0, 0.2).tilt or 0.0
+    arm.drive(1.5 if tilt < 1.1 else 0.02, 9.0, 0.2)
     if tilt > 1.1:
         print("tilted", flush=True)
     time.sleep(0.04)

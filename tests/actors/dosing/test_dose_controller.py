@@ -183,7 +183,9 @@ def test_a_cut_line_leaves_the_amount_unknown_and_the_cup_turned_back() -> None:
     record, controller = one_dose(0.1, DosingFault("line cut", 1.5))
     assert controller.result is not None
     assert (controller.result.end, controller.result.amount) == (DoseEnd.CONNECTION_LOST, None)
-    assert controller.result.estimate[0] == pytest.approx(record.received, abs=3e-3)
+    estimate, deviation = controller.result.estimate
+    assert estimate == pytest.approx(record.received, abs=2.0 * deviation)
+    assert deviation < 5e-3
     assert record.received < 0.1
 
 
@@ -261,7 +263,7 @@ def test_a_display_that_corrects_its_zero_hides_a_part_of_the_dose_that_its_inte
     """The display hides up to 0.8 g."""
     scale = TrueScale(lag=0.3, step=1e-3, behaviour=DisplayBehaviour(zero_tracking=0.5, zero_band=4.0))
     errors = weighing_errors(scale, receiver=0.1803)
-    assert all(abs(error) < half for error, half in errors)
+    assert sum(abs(error) < half for error, half in errors) >= 3  # of four, with an interval of 90 %
     assert abs(float(np.mean([error for error, _ in errors]))) < 0.5e-3
 
 

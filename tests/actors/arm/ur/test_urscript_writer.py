@@ -18,6 +18,8 @@ from actors.arm.ur.worker_messages import (
     STOP_ORDER,
     STOPPED,
     TILT_COUNTER,
+    TILT_HIGHEST,
+    TILT_PATIENCE,
     TILT_SPEED,
     MotionSettings,
 )
@@ -52,11 +54,17 @@ class Dose(Bench):
     def playing(self) -> bool:
         return self.controller.runtime is RuntimeState.PLAYING
 
-    def drive(self, speed: float, seconds: float) -> None:
-        """Write a speed [deg/s] 20 times a second."""
+    def order(self, speed: float, highest: float = 100.0, patience: float = 0.2) -> None:
+        """Write an order: speed [deg/s], largest tilt [deg], and patience [s]."""
+        inputs = self.controller.registers.input_double
+        inputs[REGISTERS + TILT_SPEED], inputs[REGISTERS + TILT_HIGHEST] = math.radians(speed), math.radians(highest)
+        inputs[REGISTERS + TILT_PATIENCE] = patience
+        inputs[REGISTERS + TILT_COUNTER] += 1
+
+    def drive(self, speed: float, seconds: float, highest: float = 100.0) -> None:
+        """Write an order 20 times a second."""
         for _ in range(round(seconds / 0.05)):
-            self.controller.registers.input_double[REGISTERS + TILT_SPEED] = math.radians(speed)
-            self.controller.registers.input_double[REGISTERS + TILT_COUNTER] += 1
+            self.order(speed, highest)
             self.tick(0.05)
 
 
@@ -102,6 +110,30 @@ def test_a_short_gap_does_not_turn_it_back() -> None:
     assert dose.tilt > before
     dose.drive(0.0, 0.3)
     assert dose.playing
+
+
+def test_the_cup_stops_at_the_largest_tilt_however_late_the_next_command_is() -> None:
+    dose = Dose()
+    dose.drive(50.0, 0.5, highest=30.0)
+    seen = []
+    for _ in range(10):  # no command for 0.2 s, at 50° per second
+        dose.tick(0.02)
+        seen.append(dose.tilt)
+    assert max(seen) == pytest.approx(30.0, abs=0.05)
+    dose.drive(50.0, 1.0, highest=20.0)  # a tilt above the largest one does not grow, and no order turns it back
+    assert dose.tilt == pytest.approx(30.0, abs=0.5)
+
+
+def test_a_command_may_ask_for_an_earlier_return() -> None:
+    dose = Dose()
+    dose.drive(50.0, 1.0, highest=30.0)
+    for patience in (0.06, 9.0):  # never later than 0.2 s
+        dose.order(0.0, 30.0, patience)
+        dose.tick(min(patience, 0.2) - 0.02)
+        assert dose.tilt > 29.5
+        dose.tick(0.15)
+        assert dose.tilt < 28.0
+        dose.drive(50.0, 0.5, highest=30.0)
 
 
 def test_range_and_speed_are_limited_whatever_is_written() -> None:
