@@ -267,7 +267,9 @@ def over_the_wires(count: int, seed: int = 3) -> list[dict[str, Any]]:
     laboratory: LaboratorySettings = plan.laboratory
     assert laboratory.arm is not None
     laboratory = laboratory.with_values(
-        in_process=True, arm=laboratory.arm.with_values(warning_time=0.2), operator={"answers": "virtual", "time": 1.0}
+        in_process=True,
+        arm=laboratory.arm.with_values(warning_time=0.2),
+        operator=laboratory.operator.with_values(time=1.0),
     )
 
     async def poured(folder: Path) -> Any:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from actors.interfaces import DoseEnd
 from actors.runtime.child_process import child_environment
 from sim_engine.simulator import fill
 
@@ -282,3 +283,19 @@ def test_what_was_measured_of_the_daemon_stands_on_its_page() -> None:
     found = {"times": 1, "cores": 2, "load before": 0.1, "first simulation of a plan": [500], "stops": stops}
     written = daemon_page.render(page, {"stops": found})
     assert "| emergency stop over wires | likewise | 12 / 46 |  |  |" in written
+
+
+@pytest.mark.parametrize(
+    ("of", "seed"),
+    [
+        ("readings", 40004),  # they arrive together after the gap, as from a serial buffer (pyserial's issue 298)
+        ("readings", 40051),  # in the approach; the arm's state is an old one, too (visp's issue 2006)
+        ("both", 40041),  # an arm that goes on by itself (Universal_Robots_Client_Library's issue 217)
+    ],
+)
+def test_doses_with_gaps_stay_within_their_tolerance(of: str, seed: int) -> None:
+    import dosing_gaps
+
+    for dose in dosing_gaps.pour_series(of, seed):
+        assert dose.error < 1.0
+        assert dose.end in (DoseEnd.REACHED, DoseEnd.MISSED)
