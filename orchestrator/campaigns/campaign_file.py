@@ -56,7 +56,7 @@ class PoursFromFile(Settings):
     """Weighed pours in a file."""
 
     source: FilePath | None = Field(default=None, alias="from")
-    """Table of weighed pours (CSV or .xlsx), with a column `split`."""
+    """Table of weighed pours (CSV or .xlsx). Columns of other names are kept as remarks."""
 
     lip_radius: Annotated[float, Quantity("m", "40 mm", 0.0, 0.5)] | None = None
     """The pourer's inner radius at the lip, if the file has lip_to_receiver_axis_mm instead of x_offset_mm."""
@@ -91,7 +91,8 @@ class PoursSettings(PoursFromFile):
     """Pours to make on the bench."""
 
     holdout: PourCount | None = None
-    """Number of these pours that are kept for testing; an eighth unless given."""
+    """Number of these pours that are kept for testing; an eighth unless given. A file with a column `split` has no
+    use for it."""
 
     design: Design | None = None
     """stratified: spread evenly over the actions; active: each chosen by its information about the deployment. Unless
@@ -118,8 +119,9 @@ class PoursSettings(PoursFromFile):
         if self.source is not None or self.from_run is not None:
             origin = "a file" if self.source is not None else "a run"
             text = f"belongs to pours that are still to be made; these are read 'from' {origin}"
-            active = ("design",) if self.design == "active" else ()
-            self.check_exclusive(problems, ("count", "holdout", "holdout_receivers", *active, "simulations"), text)
+            further = ["design"] if self.design == "active" else []
+            further += ["holdout"] if self.source is None else []
+            self.check_exclusive(problems, ("count", "holdout_receivers", *further, "simulations"), text)
             if self.source is not None and self.from_run is not None:
                 problems.add("stands beside 'from'; keep one of them", "from_run", key=True)
             return

@@ -287,8 +287,11 @@ def _sheet_rows(content: bytes, assumed: list[str], most_lines: int) -> list[Tab
     except (UnreadableError, _RowError):
         raise
     except Exception as error:  # damaged workbooks raise arbitrary errors
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            charts = any(name.startswith("xl/chartsheets/") for name in archive.namelist())
+        cause = "one of its sheets is a chart" if charts else type(error).__name__
         raise UnreadableError(
-            f"is a workbook that can't be read ({type(error).__name__}); save its first sheet as CSV"
+            f"is a workbook that can't be read ({cause}); save the sheet with the table as CSV"
         ) from None
     return rows
 
@@ -357,7 +360,9 @@ def _check_seen(stream: IO[bytes], rows: Sequence[TableRow]) -> None:
     text = f"{verb} hidden, by hand or by a filter; show what belongs to the table, and delete the others"
     refused(hidden, "row", text, lines[places[0]] if places else rows[0])
     refused(columns, "column", text)
-    refused(merged, "merged cells", "have a value in the first cell only; unmerge them, and give every row its values")
+    verb = "have" if len(merged) > 1 else "has"
+    text = f"{verb} a value in the first cell only; unmerge the cells, and give every row its values"
+    refused(merged, "merged range", text)
     refused(
         formulas,
         "cell",

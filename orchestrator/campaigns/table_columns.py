@@ -62,7 +62,15 @@ class FoundColumn:
 
 
 class _UnknownColumnError(QuantityError):
-    """A name that resembles none of the known ones."""
+    """A name that is none of the known ones.
+
+    Attributes:
+        guess: standard name of the column that it resembles; empty if it resembles none.
+    """
+
+    def __init__(self, message: str, guess: str = "") -> None:
+        super().__init__(message)
+        self.guess = guess
 
 
 def columns_of(
@@ -78,16 +86,18 @@ def columns_of(
         known: the columns that there may be.
         renamed: names in the file and the names that they stand for, with or without a unit.
         problems: problems are added here.
-        unread: unknown columns are added here; None: they are problems.
+        unread: unknown columns are added here; None: they are problems. A name that resembles a column which is missing
+            is a problem in both cases.
     """
     columns: list[FoundColumn | None] = []
+    resembling: list[tuple[int, str, _UnknownColumnError]] = []
     for index, cell in enumerate(table.header.cells):
         text = str(cell)
         try:
             column = _resolved(text, known, renamed)
         except QuantityError as error:
             if unread is not None and isinstance(error, _UnknownColumnError):
-                unread.append(text)
+                resembling.append((index, text, error))
                 columns.append(None)
                 continue
             problems.append(table.problem(table.header, index, text, str(error)))
@@ -100,6 +110,12 @@ def columns_of(
         if column.factor != 1.0 or column.alias:
             table.assumed.append(f"'{text}' as {column.standard}")
         columns.append(column)
+    names = {column.standard for column in columns if column is not None}
+    for index, text, unknown in resembling:
+        if unread is not None and (not unknown.guess or unknown.guess in names):
+            unread.append(text)
+        else:
+            problems.append(table.problem(table.header, index, text, str(unknown)))
     return columns
 
 
@@ -138,7 +154,7 @@ def _resolved(text: str, known: Sequence[KnownColumn], renamed: Mapping[str, str
         shown = names[guess].standard if guess else ""
         if not guess:
             raise _UnknownColumnError(f"unknown column; known columns: {', '.join(entry.standard for entry in known)}")
-        raise QuantityError(f"unknown column; did you mean '{shown}'?")
+        raise _UnknownColumnError(f"unknown column; did you mean '{shown}'?", shown)
     if not column.unit:
         raise QuantityError(f"'{column.name}' has no unit; remove '{unit}'")
     if unit == column.display:

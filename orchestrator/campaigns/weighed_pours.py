@@ -69,7 +69,7 @@ def resolve_records(
     section, at = pours.transfer, place.at("transfer")
     if section is not None:
         receiver = builder.references.vessel(section.receiver, at.at("receiver"))
-        other = read_table(pours, section.source, at.at("from"), builder)
+        other = read_table(pours, section.source, at.at("from"), builder, transfer=True)
         if other is not None:
             where = (*motions, (section.motion, at.at("motion")))
             if any(row.split != "transfer" for row in other.rows):
@@ -90,20 +90,41 @@ def resolve_records(
     return records, transfer
 
 
-def read_table(pours: PoursFromFile, source: str | None, place: Place, builder: SceneBuilder) -> RecordTable | None:
-    """A CSV file of calibration's pours; None if not given, or after a problem."""
+def read_table(
+    pours: PoursSettings, source: str | None, place: Place, builder: SceneBuilder, *, transfer: bool = False
+) -> RecordTable | None:
+    """A file of calibration's pours; None if not given, or after a problem.
+
+    Args:
+        transfer: whether its pours are those of the transfer scene.
+    """
     if source is None or builder.liquid is None:
         return None
-    return _read(resolved(place.directory / source), pours, builder.liquid, place, builder.report)
+    path, report = resolved(place.directory / source), builder.report
+    split, holdout = ("transfer", None) if transfer else (None, pours.holdout)
+    return _read(path, pours, builder.liquid, place, report, split, holdout)
 
 
 def _read(
-    path: Path, pours: PoursFromFile, liquid: Liquid, place: Place, report: Report, split: str | None = None
+    path: Path,
+    pours: PoursFromFile,
+    liquid: Liquid,
+    place: Place,
+    report: Report,
+    split: str | None = None,
+    holdout: int | None = None,
 ) -> RecordTable | None:
     if (missing := missing_file(path)) is not None:
         report.add(place, missing)
         return None
-    table = read_records(path, loaded=liquid.mass, lip_radius=pours.lip_radius, columns=pours.columns, split=split)
+    table = read_records(
+        path,
+        loaded=liquid.mass,
+        lip_radius=pours.lip_radius,
+        columns=pours.columns,
+        split=split,
+        holdout=holdout,
+    )
     report.problems.extend(table.problems)
     return None if table.problems else table
 

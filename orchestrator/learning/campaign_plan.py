@@ -190,6 +190,8 @@ class RecordedPour:
         poured, spilled, retained: masses [kg].
         split: 'train', 'test' or 'transfer'.
         scene: name of the scene of this pour; '' for the scene of its `RecordSet`.
+        line: line of the file; None for a pour of a run.
+        remarks: other columns of the file, {name: text}.
     """
 
     action: Action
@@ -198,6 +200,8 @@ class RecordedPour:
     retained: float
     split: str
     scene: str = ""
+    line: Annotated[int | None, NOT_IN_FINGERPRINT] = None
+    remarks: Annotated[dict[str, str], NOT_IN_FINGERPRINT] = field(default_factory=dict)
 
     @property
     def poured_fraction(self) -> float:
@@ -219,6 +223,7 @@ class MeasuredPour:
         poured: fraction of the load that left the pourer.
         split: 'train', 'test' or 'transfer'.
         scene: name of the scene of this pour; '' for the first scene of its calibration.
+        line, remarks: as in `RecordedPour`.
     """
 
     action: Action
@@ -226,11 +231,21 @@ class MeasuredPour:
     poured: float
     split: str = "train"
     scene: str = ""
+    line: int | None = None
+    remarks: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def from_record(cls, record: RecordedPour) -> MeasuredPour:
         """Convert one row of a file of recorded pours."""
-        return cls(record.action, record.spillage, record.poured_fraction, record.split, record.scene)
+        return cls(
+            record.action,
+            record.spillage,
+            record.poured_fraction,
+            record.split,
+            record.scene,
+            record.line,
+            record.remarks,
+        )
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from actors.dosing.dose_estimator import calibrated_knowledge
 from actors.interfaces import DoseKnowledge
 from orchestrator.learning.calibration.action_prior import Contexts, drawn_worlds
 from orchestrator.learning.calibration.active_design import ActivePours
-from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta
+from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta, TriedOnPours
 from orchestrator.learning.calibration.calibration_scores import (
     DRAWS,
     UNCALIBRATED,
@@ -236,6 +236,11 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
             uncalibrated=plain,
             sampled=draws,
             train_seeds=result_of(results, CALIBRATION, Calibrated).pour_seeds,
+            trials=[
+                (trial.theta, trial.differences)
+                for trial in result_of(results, CALIBRATION, Calibrated).trials
+                if isinstance(trial, TriedOnPours)
+            ],
         )
 
     fitting = StageDefinition(CALIBRATION, calibration, stand_in=_stand_in(plan))

@@ -66,6 +66,9 @@ class TriedOnPours(CalibrationTrial):
     largest: float | None
     """Largest |r − c_s| of these pours."""
 
+    differences: tuple[float | None, ...] = ()
+    """|r − c_s| on every usable training pour; None where it was not simulated, or has none."""
+
 
 class TriedOnce(CalibrationTrial):
     """C4: a θ that was simulated at one action."""

@@ -23,6 +23,14 @@ from pydantic import Field
 
 from orchestrator.learning.calibration.action_prior import Contexts
 from orchestrator.learning.calibration.pointwise_calibration import LEAST_DEFINED
+from orchestrator.learning.calibration.pour_residuals import (
+    PourResidual,
+    SimulatedPour,
+    WithoutMisfits,
+    misfit_sentence,
+    pour_residuals,
+    without_misfits,
+)
 from orchestrator.learning.campaign_plan import CalibrationPlan, MeasuredPour
 from orchestrator.learning.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
 from orchestrator.learning.stage_result import ResultPart, StageResult
@@ -130,6 +138,12 @@ class Scores(StageResult):
     gain: CalibrationGain | None = None
     """Comparison with the uncalibrated θ; None if θ* was not compared with it."""
 
+    pours: tuple[PourResidual, ...] = ()
+    """Every weighed pour with its residual, once all are simulated."""
+
+    without: WithoutMisfits | None = None
+    """θ* without the pours that do not fit; None if all fit, or if no θ was simulated on all others."""
+
 
 @dataclass
 class _Case:
@@ -225,6 +239,10 @@ class Evaluation:
             if case.simulated is not None and (r := case.scored.pour.spillage) is not None
         ]
         return float(np.mean(differences)) if differences else None
+
+    def simulated(self) -> dict[int, float | None]:
+        """c_s of the only θ, by the identity of the scored pour."""
+        return {id(case.scored): case.simulated for case in self._cases}
 
     def random_median(self, split: str) -> float | None:
         """Median of the mean discrepancies of the θ with labels 'random …' in a split."""
@@ -452,6 +470,7 @@ class CalibrationEvaluation:
         uncalibrated: SimulationParameters | None = None,
         sampled: Sequence[SimulationParameters] = (),
         train_seeds: Sequence[int] = (),
+        trials: Sequence[tuple[Mapping[str, float], Sequence[float | None]]] = (),
     ) -> None:
         """Plan the simulations.
 
@@ -463,7 +482,9 @@ class CalibrationEvaluation:
                 change is recommended.
             sampled: draws from θ's posterior.
             train_seeds: seeds of simulations on the usable training pours; empty: new ones.
+            trials: θ of the calibration with their |r − c_s| on the usable training pours.
         """
+        self._theta, self._scored, self._trials = theta, list(pours), trials
         unseen = [scored for scored in pours if scored.pour.split != "train"]
         train = [scored for scored in pours if scored.pour.split == "train"]
         # Unseen pours come first in both, so that θ* and random θ have the same seeds on them.
@@ -484,6 +505,8 @@ class CalibrationEvaluation:
             self._pours.setdefault(scored.pour.split, []).append(scored.pour)
         self._baselines: tuple[BySplit, BySplit] | None = None
         self._gain: CalibrationGain | None = None
+        self._residuals: tuple[PourResidual, ...] = ()
+        self._without: WithoutMisfits | None = None
 
     @property
     def finished(self) -> bool:
@@ -515,12 +538,21 @@ class CalibrationEvaluation:
         if owner is None:
             raise ValueError(f"this simulation was not asked for: {request}")
         owner.tell(request, outcome)
-        if self.finished and self._plain is not None:
+        if not self.finished:
+            return
+        simulated = self._calibrated.simulated()
+        self._residuals = pour_residuals(
+            [SimulatedPour(scored.pour, scored.scene, simulated.get(id(scored))) for scored in self._scored],
+            self._theta.particles,
+        )
+        self._without = without_misfits(self._residuals, self._trials)
+        if self._plain is not None:
             compared = [
                 [pair for pair in scorer.result().pairs if pair.split != "transfer"]
                 for scorer in (self._calibrated, self._plain)
             ]
-            self._gain = calibration_gain(*compared)
+            gain, misfits = calibration_gain(*compared), misfit_sentence(self._residuals, self._without)
+            self._gain = gain.model_copy(update={"text": f"{gain.text}; but {misfits}"}) if misfits else gain
 
     def progress(self) -> Progress:
         """Simulations answered, and their total number."""
@@ -541,6 +573,8 @@ class CalibrationEvaluation:
             mean_predictor=mean_predictor,
             regression=regression,
             gain=self._gain,
+            pours=self._residuals,
+            without=self._without,
         )
 
     def _without_simulator(self) -> tuple[BySplit, BySplit]:

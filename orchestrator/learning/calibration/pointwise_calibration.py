@@ -131,11 +131,14 @@ class DiscrepancyOverPours(Calibration[S]):
 
     def _row(self, number: int, trial: Trial) -> TriedOnPours:
         known = discrepancies(trial)
+        costs = {trial.requests[i].seed: cost for i, cost in trial.costs.items()}
+        by_pour = [costs.get(seed) for seed in self._seed_of_pour]
         return TriedOnPours(
             theta=self._values(trial.point),
             discrepancy=self._score(trial),
             defined=len(known),
             largest=max(known, default=None),
+            differences=tuple(None if cost is None else abs(cost) for cost in by_pour),
         )
 
 

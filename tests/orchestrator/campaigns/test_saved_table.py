@@ -249,7 +249,7 @@ IN_DOUBT |= {
     ),
     "merged cells": (
         workbook(MERGED, after='<mergeCells count="1"><mergeCell ref="B2:B4"/></mergeCells>'),
-        "pours.csv:1:1: merged cells B2:B4 have a value in the first cell only; unmerge them",
+        "pours.csv:1:1: merged range B2:B4 has a value in the first cell only; unmerge the cells",
     ),
     "merged cells, saved as text": (
         PLAIN.replace("60,110", "60,").replace("80,120", "80,"),
@@ -438,3 +438,71 @@ def test_no_damaged_workbook_ends_in_a_traceback(
     content = bytearray(workbook(cells(PLAIN)))
     content[position % len(content)] = value
     problems_of(tmp_path_factory.getbasetemp(), bytes(content))
+
+
+NOTEBOOK = """\
+pour no.,date,angular_velocity_deg_s,max_angle_deg,poured_g,spilled_g,retained_g,remarks
+1,2026-11-20,20,95,180,4,20,
+2,2026-11-20,60,110,190,30,10,glass was wet
+3,2026-11-21,80,120,199,50,1,
+4,2026-11-21,40,118,198,21,2,"slow, by hand"
+"""
+
+
+def test_columns_of_a_notebook_are_remarks_that_are_listed(tmp_path: Path) -> None:
+    table = read(tmp_path, NOTEBOOK.replace("remarks", "remarks,split").replace("\n", ",train\n").replace(
+        "remarks,split,train", "remarks,split"))  # fmt: skip
+    assert not table.problems
+    assert "columns 'pour no.', 'date', 'remarks' read as remarks" in table.assumed
+    assert table.rows[1].remarks == {"pour no.": "2", "date": "2026-11-20", "remarks": "glass was wet"}
+    assert table.rows[1].pour({"height": 0.08, "x_offset": 0.1}).remarks["remarks"] == "glass was wet"
+
+
+def test_a_table_without_splits_keeps_pours_for_testing_and_names_them(tmp_path: Path) -> None:
+    table = read(tmp_path, NOTEBOOK, holdout=2)
+    assert [row.split for row in table.rows] == ["train", "test", "train", "test"]
+    assert "no column 'split': lines 3, 5 kept for testing" in table.assumed
+    assert [row.split for row in read(tmp_path, NOTEBOOK).rows].count("test") == 1, "an eighth, at least one"
+    (problem,) = read(tmp_path, NOTEBOOK, holdout=4).problems
+    assert "none is left to fit" in str(problem)
+    (problem,) = read(tmp_path, PLAIN, holdout=1).problems
+    assert "has a column 'split'" in str(problem)
+
+
+def test_a_misspelt_column_is_no_remark(tmp_path: Path) -> None:
+    (problem,) = read(tmp_path, NOTEBOOK.replace("spilled_g", "spiled_g")).problems
+    assert "did you mean 'spilled_g'" in str(problem)
+    (problem,) = read(tmp_path, NOTEBOOK.replace("spilled_g", "lost")).problems
+    assert "column 'spilled_g' is missing (not recognised: 'pour no.', 'date', 'lost', 'remarks')" in str(problem)
+
+
+def test_a_doubled_line_is_named_and_a_pour_does_not_test_itself(tmp_path: Path) -> None:
+    assert "lines 2, 5 have the same numbers" in read(tmp_path, PLAIN + ROWS[0] + "\n").assumed
+    (problem,) = read(tmp_path, PLAIN + ROWS[0].replace("train", "test") + "\n").problems
+    assert "lines 2, 5 have the same numbers and the splits test and train" in str(problem)
+    numbered_twice = NOTEBOOK + NOTEBOOK.splitlines()[2].replace("2,", "5,", 1) + "\n"
+    assert "lines 3, 6 have the same numbers" in read(tmp_path, numbered_twice).assumed
+
+
+def test_pours_that_contradict_each_other_are_named_before_any_simulation(tmp_path: Path) -> None:
+    swapped = PLAIN.replace("180,4.25,20", "200,4.25,0").replace("200,50,0", "130,50,70")
+    assert "line 4 was tilted farther than line 2, and more stayed in the pourer (70 g, 0 g)" in read(
+        tmp_path, swapped
+    ).assumed  # fmt: skip
+    again = PLAIN + "60,110,190,110,10,train\n"
+    assert "lines 3 and 5 have the same action and spilled 15.8 % and 57.9 %" in read(tmp_path, again).assumed
+    assert not read(tmp_path, PLAIN).assumed
+
+
+def test_a_chart_as_a_sheet_of_its_own_is_named(tmp_path: Path) -> None:
+    """pandas-dev/pandas#41448, saulpw/visidata#797: AttributeError instead of a reason."""
+    content = (Path(__file__).parents[2] / "data" / "tables" / "chartsheet_first.xlsx").read_bytes()
+    (problem,) = read(tmp_path, content, "pours.xlsx").problems
+    assert "one of its sheets is a chart" in str(problem)
+
+
+def test_several_merged_ranges_are_named_in_the_plural(tmp_path: Path) -> None:
+    ranges = '<mergeCells count="2"><mergeCell ref="B2:B3"/><mergeCell ref="C2:C3"/></mergeCells>'
+    content = workbook(cells(PLAIN), after=ranges)
+    (problem,) = read(tmp_path, content, "pours.xlsx").problems
+    assert "merged ranges B2:B3, C2:C3 have a value" in str(problem)

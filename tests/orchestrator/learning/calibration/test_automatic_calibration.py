@@ -4,6 +4,7 @@ pours prefer.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -15,8 +16,14 @@ from orchestrator.learning.calibration import automatic_calibration
 from orchestrator.learning.calibration.action_prior import Contexts
 from orchestrator.learning.calibration.automatic_calibration import simulation_limit
 from orchestrator.learning.calibration.calibration_base import Calibrated
-from orchestrator.learning.calibration.calibration_scores import NOT_JUSTIFIED, CalibrationEvaluation, ScoredPour
+from orchestrator.learning.calibration.calibration_scores import (
+    NOT_JUSTIFIED,
+    CalibrationEvaluation,
+    ScoredPour,
+    Scores,
+)
 from orchestrator.learning.calibration.posterior_summary import posterior_change
+from orchestrator.learning.calibration.pour_residuals import SimulatedPour, pour_residuals
 from orchestrator.learning.campaign_plan import MeasuredPour
 from orchestrator.learning.requests import Failed, Outcome, Request, Simulate
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, deployed_theta, with_posterior
@@ -150,3 +157,54 @@ def test_the_change_of_a_posterior_is_measured_in_standard_deviations_and_across
     assert posterior_change(ridge(0.0, 0.0), ridge(0.0, 0.0)) < 0.15
     assert posterior_change(ridge(0.0, 0.0), ridge(0.1, 0.0)) == pytest.approx(1.0, abs=0.15)
     assert posterior_change(ridge(0.0, 0.0), ridge(0.0, 0.004)) > 1.5
+
+
+def test_swapped_weights_are_named_with_their_intervals_and_theta_without_them() -> None:
+    count = 12
+    pours = [replace(pour, line=i + 2) for i, pour in enumerate(poured(TRUE_THETA, count))]
+    spilled = [pour.spillage or 0.0 for pour in pours]
+    low, high = spilled.index(min(spilled)), spilled.index(max(spilled))
+    swapped = list(pours)
+    swapped[low] = replace(pours[low], spillage=spilled[high])
+    swapped[high] = replace(pours[high], spillage=spilled[low])
+
+    def scores(weighed: list[MeasuredPour]) -> Scores:
+        plan = calibration_plan(simulations="auto", fixed_parameters=PLAIN.model_dump())
+        strategy = plan.settings.build(plan, weighed, 3)
+        StrategyHarness(exact).run(strategy)
+        result = strategy.result()
+        assert isinstance(result, Calibrated)
+        evaluation = CalibrationEvaluation(
+            strategy.theta,  # type: ignore[attr-defined]
+            {},
+            [ScoredPour(SCENE.name, pour) for pour in weighed],
+            Contexts.of(plan),
+            1,
+            uncalibrated=PLAIN,
+            train_seeds=result.pour_seeds,
+            trials=[(trial.theta, trial.differences) for trial in result.trials],  # type: ignore[union-attr]
+        )
+        StrategyHarness(exact).run(evaluation)
+        return evaluation.result()
+
+    good, bad = scores(pours), scores(swapped)
+    assert all(pour.fits for pour in good.pours)
+    assert good.without is None
+    assert {pour.number for pour in bad.pours if not pour.fits} == {low + 1, high + 1}
+    assert all(pour.low is not None and pour.high is not None and pour.low < pour.high for pour in bad.pours)
+    assert bad.without is not None
+    assert bad.without.pours == tuple(sorted((low + 1, high + 1)))
+    assert bad.without.discrepancy <= bad.without.discrepancy_now < 0.05
+    assert bad.gain is not None
+    assert f"pour {low + 1} (line {low + 2}) weighed {100 * spilled[high]:.1f} %" in bad.gain.text
+    assert "without them θ* would be" in bad.gain.text
+
+
+def test_few_pours_are_not_judged_and_a_pour_does_not_hide_itself() -> None:
+    def pair(r: float, c: float, split: str = "train") -> SimulatedPour:
+        return SimulatedPour(MeasuredPour(SCENE.action(CALIBRATION_ACTIONS.decode([0.5, 0.5])), r, 0.9, split), "s", c)
+
+    few = pour_residuals([pair(0.1, 0.1), pair(0.9, 0.1)], 2000)
+    assert [pour.fits for pour in few] == [None, None]
+    many = pour_residuals([*[pair(0.2, 0.21)] * 5, pair(0.6, 0.2), pair(0.7, 0.2, "test")], 2000)
+    assert [pour.fits for pour in many] == [*[True] * 5, False, False]

@@ -1,0 +1,210 @@
+"""Residuals of single weighed pours, pours that do not fit, and θ* without them.
+
+- `pour_residuals` compares each pour with its simulation. Its interval is that in which nearly every pour lies if it is
+  a pour as the others are.
+- `without_misfits` selects θ* again, from the simulations that exist, on the pours that fit.
+
+The module decides about no pour: a pour that does not fit may be a swapped weight, or the only one of its kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist, fmean, median
+
+from pydantic import Field
+
+from orchestrator.learning.campaign_plan import MeasuredPour
+from orchestrator.learning.stage_result import ResultPart, displayed_action
+from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.prediction_band import resolution_shift, shift_of
+
+LEAST_POURS = 5
+"""Least number of training pours whose residuals are compared with each other."""
+
+DEVIATIONS = 3.0
+"""Half width of a pour's interval, in robust standard deviations of the training pours' residuals."""
+
+WEIGHING = 0.02
+"""Deviation of a weighed pour from its repetition, as a share of the poured liquid, that is always allowed."""
+
+_NORMAL = NormalDist()
+_MAD = 1.0 / _NORMAL.inv_cdf(0.75)
+"""Standard deviation of a normal distribution by its median absolute deviation."""
+
+
+class PourResidual(ResultPart):
+    """A weighed pour with its simulation by θ*, as shares of the poured liquid."""
+
+    number: int
+    """Place of the pour among all weighed pours of the calibration, from 1."""
+
+    line: int | None
+    """Line of the table that the pour is from."""
+
+    split: str
+    """'train', 'test' or 'transfer'."""
+
+    scene: str
+    """Name of the scene."""
+
+    action: dict[str, float | None]
+    """Action in the units of tables: {'max_angle_deg': 100.0, …}."""
+
+    measured: float
+    """Weighed spillage r."""
+
+    simulated: float | None
+    """Simulated spillage c_s; None if it is undefined."""
+
+    residual: float | None
+    """r − c_s."""
+
+    low: float | None
+    """Lower end of the interval of r; None with fewer than five training pours."""
+
+    high: float | None
+    """Upper end of the interval of r."""
+
+    fits: bool | None
+    """Whether r lies in the interval; None if there is none."""
+
+    remarks: dict[str, str] = Field(default_factory=dict)
+    """Other columns of the table."""
+
+    @property
+    def name(self) -> str:
+        """The pour as the user can find it: 'pour 3 (line 4)'."""
+        return f"pour {self.number}" + ("" if self.line is None else f" (line {self.line})")
+
+
+class WithoutMisfits(ResultPart):
+    """θ* if the pours that do not fit were left out, selected from the simulations that exist."""
+
+    pours: tuple[int, ...]
+    """Numbers of the training pours that are left out."""
+
+    theta: dict[str, float]
+    """Searched parameters."""
+
+    discrepancy: float
+    """Mean |r − c_s| of the remaining training pours with it."""
+
+    discrepancy_now: float
+    """Mean |r − c_s| of the remaining training pours with θ*."""
+
+
+@dataclass(frozen=True)
+class SimulatedPour:
+    """A weighed pour and its simulation with θ*.
+
+    Attributes:
+        scene: name of the scene.
+        simulated: c_s; None if it is undefined.
+    """
+
+    pour: MeasuredPour
+    scene: str
+    simulated: float | None
+
+
+def pour_residuals(pours: Sequence[SimulatedPour], particles: int) -> tuple[PourResidual, ...]:
+    """Residuals of all pours with a spillage.
+
+    The scale of a pour's interval is the median of the *other* training pours' shifts, so that it does not hide itself;
+    shifts are explained in `sim_engine.prediction_band`. It is at least the error of the particles.
+
+    Args:
+        pours: weighed pours in the order of the user's table.
+        particles: of a simulation.
+    """
+    shifts: dict[int, float] = {}
+    for i, entry in enumerate(pours):
+        r, c = entry.pour.spillage, entry.simulated
+        if r is not None and c is not None and entry.pour.split == "train":
+            shifts[i] = abs(shift_of(r, particles) - shift_of(c, particles))
+    residuals = []
+    for i, entry in enumerate(pours):
+        r, c, pour = entry.pour.spillage, entry.simulated, entry.pour
+        if r is None:
+            continue
+        low = high = None
+        if c is not None and len(shifts) >= LEAST_POURS:
+            scale = max(_MAD * median(z for k, z in shifts.items() if k != i), resolution_shift(particles))
+            place, half = shift_of(c, particles), DEVIATIONS * scale
+            low, high = (_NORMAL.cdf(place + side * half) + side * WEIGHING for side in (-1.0, 1.0))
+            low, high = max(low, 0.0), min(high, 1.0)
+        residuals.append(
+            PourResidual(
+                number=i + 1,
+                line=pour.line,
+                split=pour.split,
+                scene=entry.scene,
+                action=displayed_action({name: getattr(pour.action, name) for name in ACTION_DIMENSIONS}),
+                measured=r,
+                simulated=c,
+                residual=None if c is None else r - c,
+                low=low,
+                high=high,
+                fits=None if low is None or high is None else low <= r <= high,
+                remarks=dict(pour.remarks),
+            )
+        )
+    return tuple(residuals)
+
+
+def without_misfits(
+    residuals: Sequence[PourResidual], trials: Sequence[tuple[Mapping[str, float], Sequence[float | None]]]
+) -> WithoutMisfits | None:
+    """θ* without the training pours that do not fit; None if all fit, or no θ was simulated on all others.
+
+    Args:
+        residuals: as `pour_residuals` returns them.
+        trials: θ with its |r − c_s| on every usable training pour, in the same order; None where there is none.
+    """
+    train = [pour for pour in residuals if pour.split == "train"]
+    kept = [i for i, pour in enumerate(train) if pour.fits is not False and pour.residual is not None]
+    if len(kept) == len(train) or not kept:
+        return None
+    complete = [
+        (fmean(differences), theta)
+        for theta, costs in trials
+        if len(costs) == len(train)
+        and len(differences := [c for i in kept if (c := costs[i]) is not None]) == len(kept)
+    ]
+    if not complete:
+        return None
+    discrepancy, theta = min(complete, key=lambda pair: pair[0])
+    return WithoutMisfits(
+        pours=tuple(pour.number for pour in train if pour.fits is False),
+        theta=dict(theta),
+        discrepancy=discrepancy,
+        discrepancy_now=fmean(abs(train[i].residual or 0.0) for i in kept),
+    )
+
+
+def misfit_sentence(residuals: Sequence[PourResidual], without: WithoutMisfits | None) -> str:
+    """Names the pours that do not fit and what θ* would be without them; '' if all fit."""
+    misfits = [pour for pour in residuals if pour.fits is False and pour.split != "transfer"]
+    if not misfits:
+        return ""
+    count = sum(pour.split != "transfer" for pour in residuals)
+    named = "; ".join(
+        f"{pour.name} weighed {_percent(pour.measured)}, simulated {_percent(pour.simulated)} "
+        f"({_percent(pour.low)} … {_percent(pour.high)} expected)"
+        for pour in misfits
+    )
+    verb = "does" if len(misfits) == 1 else "do"
+    text = f"{len(misfits)} of {count} pours {verb} not fit the others: {named}; check what was entered for them"
+    if without is not None:
+        values = ", ".join(f"{name} {value:.3g}" for name, value in without.theta.items())
+        text += (
+            f"; without them θ* would be {values}, mean |Δ| of the others {_percent(without.discrepancy)} "
+            f"(now {_percent(without.discrepancy_now)})"
+        )
+    return text
+
+
+def _percent(share: float | None) -> str:
+    return "undefined" if share is None else f"{100 * share:.1f} %"
