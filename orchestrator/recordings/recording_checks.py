@@ -89,7 +89,8 @@ def impossible(
     reading = _Reading(tilt.values + grip, tilt.times, mass.times, net)
     fact, place, excess = _contradiction(scene, reading)
     line = int(mass.lines[place])
-    for other in _other_meanings(reading, mass.values, step, contradicted=bool(fact)):
+    time_name = str(series.table.header.cells[series.places["time"]])
+    for other in _other_meanings(reading, mass.values, step, time_name, contradicted=bool(fact)):
         contradiction, _, other_excess = _contradiction(scene, other)
         if not contradiction or (other.certain and excess and not other_excess):
             return [series.problem(line, "; ".join(filter(None, (fact, other.cause))), other.quantity)]
@@ -128,7 +129,9 @@ def _contradiction(scene: Scene, read: _Reading) -> tuple[str, int, bool]:
     return fact, place, bool(len(above))
 
 
-def _other_meanings(read: _Reading, readings: Floats, step: float | None, *, contradicted: bool) -> Iterator[_Reading]:
+def _other_meanings(
+    read: _Reading, readings: Floats, step: float | None, time_name: str, *, contradicted: bool
+) -> Iterator[_Reading]:
     """Other meanings of the columns that may be the true one; of those that explain a pour, not its absence."""
     gain = float(np.abs(read.net).max())
     finest = np.diff(np.unique(np.round(readings, 9)))
@@ -143,7 +146,8 @@ def _other_meanings(read: _Reading, readings: Floats, step: float | None, *, con
         return _Reading(change(read.tilts), read.times, read.read_times, read.net, "tilt", cause, certain)
 
     interval = float(np.median(np.diff(read.times)))
-    for factor, unit, name in ((60.0, "minutes", "time_min"), (1e3, "seconds", "time_s")):
+    last = (3600.0, "hours", "time_h") if time_name == "time_s" else (1e3, "seconds", "time_s")
+    for factor, unit, name in ((60.0, "minutes", "time_min"), last):
         if interval < INTERVALS[0] <= factor * interval <= INTERVALS[1]:
             cause = f"these times look like {unit}; name the column {name}"
             yield _Reading(read.tilts, factor * read.times, factor * read.read_times, read.net, "time", cause)

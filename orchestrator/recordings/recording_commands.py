@@ -81,6 +81,7 @@ def replay(
     from orchestrator.recordings.recording_figures import replay_figure
     from orchestrator.recordings.recording_fit import read_values
     from orchestrator.recordings.recording_replay import ReplayValues, replay_recording
+    from orchestrator.recordings.recording_verdict import likely_cause, replay_doubts, verdict_sentence
     from orchestrator.reports.figure_style import save
     from sim_engine.errors import DecantError
     from sim_engine.liquids import SimulationParameters
@@ -100,6 +101,10 @@ def replay(
                     recording, settings, parameters=theta, seed=seed, particles=particles > 0, simulator=simulator
                 )
             print(replay_text(report))
+            if doubts := replay_doubts(report):
+                with waiting_for(lambda text=f"looking for the cause in {recording.name}": text):  # type: ignore[misc]
+                    cause = likely_cause([recording])
+                print_warning(verdict_sentence(doubts, cause))
             if png is not None:
                 with Refused(OSError, at="--png: "):
                     print_note(f"picture  {save(replay_figure(report), png / f'{recording.name}.png')}")
@@ -128,10 +133,14 @@ def fit(
 ) -> None:
     """Fit unknown quantities that recorded pours share, with 90 % intervals, and judge the fit on other readings.
 
+    A fit that can't be right is refused with its likely cause, exit code 2: values far from those of a rig that was set
+    up with care, or residuals that are large against the pour.
+
     The model is the tilting cup with the lag of the balance, not the particles; its flow is always fitted. Judged are
     the recordings of '--judge', and with '--until' the later readings of the fitted ones.
     """
     from orchestrator.recordings.recording_fit import fit_recordings, judge_recording
+    from orchestrator.recordings.recording_verdict import unlikely
     from sim_engine.settings.quantity import QuantityError, typed_quantity
 
     with Refused(QuantityError, at="--until: "):
@@ -145,6 +154,8 @@ def fit(
         raise RefusalError(text)
     with waiting_for(lambda: f"fitting {len(loaded)} recorded pours"):
         fitted = fit_recordings(loaded, tuple(unknown or ("grip", "lag")), until=seconds)
+        if refusal := unlikely(loaded, fitted):
+            raise RefusalError(f"no value is found: {refusal}")
         judgements = [judge_recording(fitted, pour) for pour in (*(loaded if seconds is not None else ()), *others)]
     print(fit_text(fitted, judgements))
     if output is not None:

@@ -120,6 +120,7 @@ class FittedValue:
         name: in `UNKNOWNS`.
         low, high: interval with a probability of 90 %.
         identified: whether the readings have at least halved what was uncertain before.
+        deviations: distance from the value before the fit, in its standard deviations.
     """
 
     name: str
@@ -127,6 +128,7 @@ class FittedValue:
     low: float
     high: float
     identified: bool
+    deviations: float
 
     @property
     def text(self) -> str:
@@ -160,6 +162,12 @@ class Fit:
     _mean: Floats
     _covariance: Floats
     _noise: float
+
+    @property
+    def own_deviations(self) -> tuple[float, ...]:
+        """Largest distance of onset, flow and fill of each recording from what is usual, in standard deviations."""
+        own = np.abs(self._mean[len(self._names) + 1 :]).reshape(-1, OWN).max(axis=1)
+        return tuple(map(float, own))
 
     def __getitem__(self, name: str) -> FittedValue:
         """The value of an unknown. Raises KeyError if it was not fitted."""
@@ -272,7 +280,8 @@ def fit_recordings(
         further = LIP if name == "grip" else FILM / middle if name == "lag" else 0.0
         deviation = math.hypot(unknown.deviation * float(np.sqrt(covariance[i, i])), further)
         low, high = (float(unknown.at(state[i] + sign * QUANTILE * deviation / unknown.deviation)) for sign in (-1, 1))
-        values.append(FittedValue(name, middle, low, high, deviation < 0.5 * UNKNOWNS[name].deviation))
+        identified = deviation < 0.5 * UNKNOWNS[name].deviation
+        values.append(FittedValue(name, middle, low, high, identified, float(state[i])))
     residuals = problem.residuals(state)
     return Fit(
         tuple(values),

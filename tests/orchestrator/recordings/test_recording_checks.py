@@ -78,6 +78,7 @@ def misread(
         ),
         ({"header": "time_ms,tilt_deg,mass_g"}, "time", "these times look like seconds; name the column time_s"),
         ({"time": lambda time: time / 60.0}, "time", "these times look like minutes; name the column time_min"),
+        ({"time": lambda time: time / 3600.0}, "time", "these times look like hours; name the column time_h"),
         ({"time": lambda time: 1e3 * time}, "time", "if that is in milliseconds, name the column time_ms"),
         ({"filled": True}, "mass", "every line has a mass, and 63 % of them repeat the one before while it rises"),
         (
