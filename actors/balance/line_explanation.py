@@ -207,7 +207,9 @@ def explain_capture(capture: Capture) -> tuple[list[str], str | None]:
         elif len(labels) > 1:
             problem += f"As their letters show, {IN_TURN}, with its unit"
         else:
-            problem += "Set the balance to print the weight in g with its unit, or choose another protocol in its menu"
+            stated = any(re.search(rb"[0-9] *(?:mg|g|kg)\b", line) for line in lines)
+            how = "as one of the protocols in the page on balances" if stated else "in g with its unit"
+            problem += f"Set the balance to print the weight {how}, or choose another protocol in its menu"
             if not capture.about:
                 problem += ". A program that cuts blanks at the ends of lines off damages them"
         return text, problem

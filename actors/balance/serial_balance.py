@@ -35,7 +35,7 @@ from actors.balance.balance_interface import (
 )
 from actors.balance.balance_settings import SerialBalanceSettings, Settled, Settling
 from actors.balance.dialect_detection import Detected, detect
-from actors.balance.dialects.dialect import Dialect, LineSettings
+from actors.balance.dialects.dialect import Dialect, LineForm, LineSettings
 from actors.balance.line_explanation import explain_line, shown_bytes
 from actors.balance.line_recording import Recorder, Source
 from actors.balance.readings import (
@@ -73,6 +73,7 @@ class Conversation:
         self.refused: bytes | None = None
         """The last line without a weight since the last query."""
         self._wire: Wire | None = None
+        self._form = LineForm()
         self._asked_at = -math.inf
 
     @property
@@ -251,6 +252,10 @@ class Conversation:
                 self.counters.other += 1
             else:
                 self.counters.damaged += 1
+            self.refused = line
+            return None
+        if isinstance(reply, Reading) and reply.value is not None and not self._form.keeps(line):
+            self.counters.damaged += 1
             self.refused = line
             return None
         self.counters.lines += 1

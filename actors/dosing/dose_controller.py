@@ -170,6 +170,10 @@ SEEN_AFTER = 0.5
 LONGEST_DOUBT = (1.2, 2.5)
 """Time with implausible readings after which the cup is turned back: [s], and at least so many readings."""
 
+OTHER_NUMBER, FAR_OFF = 8.0, 0.02
+"""A reading that is so many times the expected mass, or its inverse, and so far from it [kg], is a damaged number: a
+lost decimal point or digit changes it by a factor of ten."""
+
 EARLIEST_WEIGHING = 2.0
 """Time after which a reading at rest may be completed with the rise that the balance still lags behind [lags]."""
 
@@ -767,9 +771,11 @@ class DoseController:
         self._unchanged_since = reading.time
         predicted = e.predicted(reading.time)
         gate = max(5.0 * math.hypot(float(predicted.std()), e.deviation()), 1.5e-3 + 0.1 * self.flow)
-        if abs(net.mass - float(predicted.mean())) > gate:
+        expected = float(predicted.mean())
+        if abs(net.mass - expected) > gate:
             self._doubt_since = self._doubt_since if self._doubt_since is not None else reading.time
-            if self.phase is not DosePhase.SETTLE:
+            most, least = OTHER_NUMBER * expected + FAR_OFF, expected / OTHER_NUMBER - FAR_OFF
+            if self.phase is not DosePhase.SETTLE or not least < net.mass < most:
                 return
         else:
             self._doubt_since = None

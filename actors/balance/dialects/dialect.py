@@ -126,6 +126,46 @@ class Dialect(ABC):
         return {self.name: lambda: PlainEncoder(self, self.query, self.tare, self.zero)}
 
 
+CHANGED = 3
+"""Lines of another form in a row after which it counts as the form of this balance, whose range or unit has changed."""
+
+_FIELD = re.compile(rb"(?P<before>[ +-]*)(?P<digits>[0-9]+(?:[.,](?P<decimals>[0-9]+))?)")
+
+
+class LineForm:
+    """Form of the weights of one connection: the column in which the number ends, and its decimals.
+
+    Balances that write numbers to the right of a field end all of them in one column. A line that has lost a byte ends
+    elsewhere, or has no decimals. Such a line is refused, unless the form repeats, as after a change of the range.
+
+    Limitations: the form is known from the first number with several blanks before it.
+    """
+
+    def __init__(self) -> None:
+        self._form: tuple[int, int] | None = None
+        self._other: tuple[int, int] | None = None
+        self._count = 0
+
+    def keeps(self, line: bytes) -> bool:
+        """Whether a line with a weight has the form of the lines before it."""
+        match = _FIELD.search(line)
+        if match is None:
+            return True
+        form, padded = (match.end("digits"), len(match["decimals"] or b"")), match["before"].count(b" ") > 1
+        if form == self._form:
+            self._other = None
+            return True
+        if self._form is None:
+            self._form = form if padded else None
+            return True
+        self._count = self._count + 1 if form == self._other else 1
+        self._other = form
+        if self._count < CHANGED:
+            return False
+        self._form, self._other = form if padded else None, None
+        return True
+
+
 def text_of(line: bytes) -> str | None:
     """Return a line as text; None if it contains anything but printable ASCII."""
     if any(not 0x20 <= byte < 0x7F for byte in line):

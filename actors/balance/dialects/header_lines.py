@@ -21,7 +21,8 @@ MC-10K p. 36 (tare, date, data number), AD-4406 p. 47 (`TR`), Kern's KFB-TM, KFN
 baud 7E1, Kern 9600 baud 8N1. No source was found for the end of Kern's commands; the driver sends CR LF.
 
 Limitations: the lines carry no checksum and, except for A&D's, no fixed width. A line that lost a digit on the way is
-another weight; only the agreement of several readings protects from it. No line reports a fault.
+another weight; `LineForm` refuses it if a number before it had blanks in front, otherwise only the agreement of several
+readings protects from it. No line reports a fault.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ _WORDS = {
     "Cal.Ext.": ReadingStatus.BUSY,
     "C": ReadingStatus.BUSY,
 }
-_FAULT = re.compile(r"(?:Err|ERR) *(?P<number>[0-9]{1,4})|(?P<word>(?:APP|DIS|PRT)\.ER)")
+_FAULT = re.compile(r"(?:Err|ERR|E) *(?P<number>[0-9]{1,4})|(?P<word>(?:APP|DIS|PRT)\.ER)")
 _BRACKETS = re.compile(r"\[([0-9]+)\]")
 
 WEIGHTS = {"": None, "N": WeightMark.NET, "G#": WeightMark.GROSS}
