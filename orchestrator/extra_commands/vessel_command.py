@@ -22,6 +22,7 @@ from orchestrator.cli.console import RefusalError, print_note, print_warning, wa
 if TYPE_CHECKING:
     from sim_engine.vessel.mesh_shape import Axis
     from sim_engine.vessel.shapes import LengthUnit
+    from sim_engine.vessel_acquisition.mesh_repair import MissingWallError
     from sim_engine.vessel_acquisition.outline_fit import Evidence, FittedOutline
 
 CALLIPERS = 2e-4
@@ -151,13 +152,17 @@ def mesh(
     def work(notes: list[str]) -> Made:
         from sim_engine.resources import require
         from sim_engine.vessel.mesh_shape import usual_up
-        from sim_engine.vessel_acquisition.mesh_repair import mended
+        from sim_engine.vessel_acquisition.mesh_repair import MissingWallError, mended
 
         require("manifold3d", "the repair of a mesh")
         thick, axis = _quantity(wall, "--wall", "m", "3 mm"), _axis(up) if up else usual_up(file)
-        result = mended(file, unit=_unit(unit), wall=thick, up=axis, drop_bodies=drop_bodies)
+        try:
+            result = mended(file, unit=_unit(unit), wall=thick, up=axis, drop_bodies=drop_bodies)
+        except MissingWallError as error:
+            picture = _draw_missing(file.name, error, out.with_suffix(".png"))
+            raise MissingWallError(f"{error}. Picture: {picture}", error.corners, error.holes) from None
         notes += result.notes
-        return _written_mesh(out, vessel, result.vertices, result.faces, notes, result.warnings, up=axis)
+        return _written_mesh(out, vessel, result.vertices, result.faces, notes, result.warnings, up=axis, given=file)
 
     _make(out, vessel, work)
 
@@ -434,8 +439,12 @@ def _written_mesh(
     doubts: Sequence[str] = (),
     *,
     up: Axis = "z",
+    given: Path,
 ) -> Made:
-    """Write a mesh in millimetres next to the vessel's file, after checking that it holds liquid."""
+    """Write a mesh in millimetres next to the vessel's file, after checking that it holds liquid.
+
+    The mesh has the name of the vessel's file; if that is the mesh `given`, '-repaired' is added.
+    """
     import trimesh
 
     from orchestrator.reports import figure_style
@@ -448,8 +457,12 @@ def _written_mesh(
     from sim_engine.vessel.vessel import build_vessel
 
     name, path = vessel.name or out.stem, out.with_suffix(".stl")
+    if path.exists() and path.samefile(given):
+        path = out.with_name(f"{out.stem}-repaired.stl")
     if path.exists():
-        raise RefusalError(f"{path}: exists already; choose another name, or remove it first")
+        raise RefusalError(
+            f"{path}: exists already, and the repaired mesh would be written there; name {out} otherwise"
+        )
     trimesh.Trimesh(1e3 * vertices, faces, process=False).export(path)
     try:
         built = build_vessel(VesselSpec(name=name, shape=MeshShape(path=path, unit="mm", up=up)))
@@ -475,6 +488,29 @@ def _written_mesh(
     lines += [f"name: {json.dumps(name, ensure_ascii=False)}", f"mesh: {path.name}", "unit: mm", f"up: {up}"]
     out.write_text("\n".join(lines) + "\n")
     return Made(built.capacity, deviation, picture, notes, doubts)
+
+
+def _draw_missing(name: str, error: MissingWallError, path: Path) -> Path:
+    """The wall unrolled: corners that are there, and the boundaries of the holes."""
+    import numpy as np
+
+    from orchestrator.reports import figure_style
+
+    middle = 0.5 * (error.corners.min(axis=0) + error.corners.max(axis=0))[:2]
+    bottom = float(error.corners[:, 2].min())
+
+    def unrolled(points: Any) -> tuple[Any, Any]:
+        around = np.degrees(np.arctan2(points[:, 1] - middle[1], points[:, 0] - middle[0])) % 360.0
+        return around, 1e3 * (points[:, 2] - bottom)
+
+    figure, axes = figure_style.new_figure(size=(6.0, 4.0))
+    axes.plot(*unrolled(error.corners), ".", color=figure_style.INK, ms=2, label="corners of the mesh")
+    for k, hole in enumerate(error.holes):
+        label = "edge of what is missing" if k == 0 else None
+        axes.plot(*unrolled(hole), "o", color=figure_style.MEASURED, ms=4, label=label)
+    figure_style.dress(axes, title=f"{name}: wall, unrolled", x="angle around the axis [deg]", y="height [mm]")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, frameon=False, fontsize=8)
+    return figure_style.save(figure, path)
 
 
 def register(app: typer.Typer) -> None:

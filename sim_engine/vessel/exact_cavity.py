@@ -111,6 +111,7 @@ class Filler:
 def fillers(vertices: Floats, faces: Integers, *, together: bool = False) -> Iterator[Filler]:
     """Find separate bodies without which a closed mesh would hold more.
 
+    A body whose box contains all others is the vessel itself: what is left without it may be a chamber in its wall.
     Costs nothing for a mesh of one body.
 
     Args:
@@ -128,6 +129,9 @@ def fillers(vertices: Floats, faces: Integers, *, together: bool = False) -> Ite
         chosen = component == body
         rest = remaining & ~chosen
         corners, others = vertices[faces[chosen]], vertices[faces[rest]]
+        low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+        if np.all(low <= others.min(axis=(0, 1))) and np.all(high >= others.max(axis=(0, 1))):
+            continue
         middle = corners.mean(axis=(0, 1))[:2]
         over = np.all(middle >= others.min(axis=(0, 1))[:2]) and np.all(middle <= others.max(axis=(0, 1))[:2])
         if not over or whole is None:

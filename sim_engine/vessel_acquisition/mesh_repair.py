@@ -61,6 +61,14 @@ HOLE = 0.6
 LARGE_HOLE = 0.01
 """Share of the surface from which a closed hole, or an open surface that is dropped, is a warning."""
 
+ARC, ALL_AROUND, ARC_HEIGHT = 30.0, 330.0, 0.15
+"""Angles around the axis between which a hole is a missing part of the wall [deg], and its least height as a share of
+the vessel's. Smaller holes are closed, larger ones are openings. A flat patch across 30° lies 3 % of the radius
+inside."""
+
+RIM, COMPACT = 0.98, 0.5
+"""Share of the vessel's height from which a hole goes through the rim; share of its box that another one takes."""
+
 BESIDE = 1e-4
 """Largest height above the underside of a bowl of an open surface that is its stem or foot [m]."""
 
@@ -88,6 +96,40 @@ class RepairedMesh:
     unit: LengthUnit
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class MissingArc:
+    """A part of the wall that is missing.
+
+    Attributes:
+        begin, end: around the axis, from x [deg].
+        bottom, top: above the underside [m].
+    """
+
+    begin: float
+    end: float
+    bottom: float
+    top: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.end - self.begin:.0f}° around the axis ({self.begin:.0f}° to {self.end:.0f}° from x), "
+            f"{1e3 * self.bottom:.0f} to {1e3 * self.top:.0f} mm above the underside"
+        )
+
+
+class MissingWallError(VesselError):
+    """A hole takes out so much of a wall that its closing would be a guess.
+
+    Attributes:
+        corners: of the surface that is there, shape (N, 3) [m], z up.
+        holes: boundaries of the holes, each (M, 3) [m].
+    """
+
+    def __init__(self, message: str, corners: Floats, holes: list[Floats]) -> None:
+        super().__init__(message)
+        self.corners, self.holes = corners, holes
 
 
 @dataclass
@@ -163,12 +205,16 @@ def mended(
         _require_igl()
         joined = _remade(vertices, faces, log)
     vertices, faces = joined
-    if unit is None and (held := log.capacity(vertices, faces)) and not LEAST <= held <= MOST:
+    if (held := log.capacity(vertices, faces)) and not LEAST <= held <= MOST:
         sizes = ", ".join(
             f"--unit {u} ({1e3 * extent * UNITS[u]:.4g} mm, {1e6 * held * (UNITS[u] / UNITS[length_unit]) ** 3:.3g} mL)"
             for u in UNITS
         )
-        raise VesselError(f"{path.name}: its unit is not clear from its size and its capacity; say which: {sizes}")
+        if unit is None:
+            raise VesselError(f"{path.name}: its unit is not clear from its size and its capacity; say which: {sizes}")
+        log.warnings.append(
+            f"in {unit} it holds {1e6 * held:.3g} mL, which no vessel on a bench does; is the unit right? {sizes}"
+        )
     return RepairedMesh(_thick_enough(vertices, faces, log), faces, length_unit, tuple(log.notes), tuple(log.warnings))
 
 
@@ -310,6 +356,14 @@ def _without_holes(vertices: Floats, faces: Integers, wall: float | None, log: _
         # an inner and an outer surface without a rim between them: closed each by itself, they would hold nothing
         around = [bool(np.ptp(upright[loop, :2], axis=0).min() > 0.5 * width) for loop in loops]
         small = [loop for loop, each in zip(loops, around, strict=True) if sum(around) < 2 or not each]
+    if arcs := [arc for loop in small if (arc := _missing_arc(upright, loop)) is not None]:
+        raise MissingWallError(
+            f"{log.path.name}: a part of its wall is missing: {' and '.join(map(str, arcs))}. What closes so large a "
+            "hole is a guess: scan the vessel again from that side, close the hole in a mesh program, or describe the "
+            "vessel by --height and --diameters (vessel profile)",
+            upright[np.unique(faces)],
+            [upright[loop] for loop in small],
+        )
     if small:
         vertices, faces, areas = holes_filled(vertices, faces, small)
         longest = 1e3 * max(_length(vertices, loop) for loop in small)
@@ -332,6 +386,30 @@ def _without_holes(vertices: Floats, faces: Integers, wall: float | None, log: _
     log.notes.append(f"the sheet was thickened outwards by {1e3 * wall:g} mm")
     thick = _thickened(_mesh(vertices, faces), wall)
     return np.asarray(thick.vertices, dtype=float), np.asarray(thick.faces, dtype=np.int64)
+
+
+def _missing_arc(upright: Floats, loop: Integers) -> MissingArc | None:
+    """The part of the wall that a hole takes out; None for a small hole, one in the floor, or one all around."""
+    low, high = upright.min(axis=0), upright.max(axis=0)
+    corners, middle = upright[loop], 0.5 * (low + high)[:2]
+    corners = corners[np.linalg.norm(corners[:, :2] - middle, axis=1) > 0.25 * float(np.min((high - low)[:2]))]
+    if len(corners) < 3:
+        return None
+    x, y = (corners[:, :2] - middle).T
+    angles = np.sort(np.degrees(np.arctan2(y, x)) % 360.0)
+    gaps = np.diff(np.append(angles, angles[0] + 360.0))
+    widest = int(np.argmax(gaps))
+    begin, span = float(angles[(widest + 1) % len(angles)]), 360.0 - float(gaps[widest])
+    bottom, top = float(corners[:, 2].min() - low[2]), float(corners[:, 2].max() - low[2])
+    height = float(high[2] - low[2])
+    if not ARC <= span <= ALL_AROUND or top - bottom < ARC_HEIGHT * height:
+        return None
+    # a hole through the rim has an inner and an outer edge; another one fills its box, and a chain of gaps does not
+    around = (np.degrees(np.arctan2(y, x)) - begin) % 360.0
+    enclosed = 0.5 * abs(float(np.sum(around * np.roll(corners[:, 2], -1) - np.roll(around, -1) * corners[:, 2])))
+    if top < RIM * height and enclosed < COMPACT * span * (top - bottom):
+        return None
+    return MissingArc(begin, begin + span, bottom, top)
 
 
 def _is_sheet(vertices: Floats, faces: Integers) -> bool:

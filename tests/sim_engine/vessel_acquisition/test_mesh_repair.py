@@ -7,6 +7,7 @@ made here follow public reports; each test names its own.
 from __future__ import annotations
 
 import gzip
+import itertools
 import logging
 import re
 from collections.abc import Callable
@@ -372,3 +373,83 @@ def test_a_thin_wall_of_a_round_vessel_is_thickened_with_a_note(
     vessel(out, height="50 mm", diameters="1 mm: 100 mm, 25 mm: 150 mm, 50 mm: 160 mm", wall="0.4 mm")
     assert "a wall of 0.4 mm and a floor of 0.4 mm are too thin" in capsys.readouterr().err
     assert "wall: 1.2" in out.read_text()
+
+
+def glass(path: Path, *, missing: str = "", chamber: bool = False, scale: float = 1.0) -> Path:
+    """A glass of 311 mL, perhaps without 60° of a wall, or with a closed chamber in it."""
+    around = np.linspace(0.0, 2.0 * np.pi, 73)
+
+    def surface(points: list[tuple[float, float]], keep: Callable[[float, float], bool]) -> list[list[np.ndarray]]:
+        outline = [points[0]]
+        for (r0, z0), (r1, z1) in itertools.pairwise(points):
+            steps = max(1, int(np.hypot(r1 - r0, z1 - z0) / 5.0))
+            outline += [(r0 + (r1 - r0) * k / steps, z0 + (z1 - z0) * k / steps) for k in range(1, steps + 1)]
+        triangles = []
+        for a, b in itertools.pairwise(around):
+            for (r0, z0), (r1, z1) in itertools.pairwise(outline):
+                if keep(np.degrees(a), min(z0, z1)):
+                    p, q, s, t = (
+                        np.array([r * np.cos(w), r * np.sin(w), z])
+                        for r, z, w in ((r0, z0, a), (r0, z0, b), (r1, z1, b), (r1, z1, a))
+                    )
+                    triangles += [[p, q, s], [p, s, t]]
+        return triangles
+
+    def arc(angle: float, z: float) -> bool:
+        return not 30.0 <= angle < 90.0
+
+    inner = [(0.0, 4.0), (30.0, 4.0), (33.0, 50.0), (36.0, 95.0)]
+    outer = [(39.0, 95.0), (36.0, 50.0), (34.0, 0.0)]
+    whole = [*inner, *outer, (0.0, 0.0)]
+    if missing == "outer wall":
+        triangles = surface([*inner, outer[0]], lambda angle, z: True) + surface(outer, arc)
+        triangles += surface([outer[-1], (0.0, 0.0)], lambda angle, z: True)
+    elif missing == "rim":
+        triangles = surface(whole, lambda angle, z: z < 70.0 or arc(angle, z))
+    else:
+        triangles = surface(whole, lambda angle, z: True)
+    if chamber:
+        ring = [(34.5, 60.0), (35.5, 60.0), (36.0, 80.0), (35.3, 80.0), (34.5, 60.0)]
+        triangles += [t[::-1] for t in surface(ring, lambda angle, z: True)]
+    corners = scale * np.array(triangles)
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+    mesh.merge_vertices()
+    mesh.update_faces(mesh.nondegenerate_faces())
+    mesh.export(path)
+    return path
+
+
+@pytest.mark.parametrize(("missing", "heights"), [("outer wall", "0 to 95 mm"), ("rim", "70 to 95 mm")])
+def test_a_wall_without_an_arc_is_refused_with_what_is_missing_and_a_picture(
+    missing: str, heights: str, tmp_path: Path
+) -> None:
+    scan = glass(tmp_path / "scan.stl", missing=missing)
+    ended = CliRunner().invoke(app, ["vessel", "mesh", str(scan), str(tmp_path / "v.yaml"), "--unit", "mm"])
+    assert ended.exit_code == 2
+    text = " ".join(ended.output.split())
+    assert f"55° around the axis (35° to 90° from x), {heights} above the underside" in text
+    assert (tmp_path / "v.png").is_file()
+    assert not (tmp_path / "v.yaml").exists()
+
+
+def test_a_stated_unit_does_not_hide_an_implausible_size(tmp_path: Path) -> None:
+    found = mended(glass(tmp_path / "unitless.stl", scale=0.01), unit="m", wall=None)
+    (warning,) = [text for text in found.warnings if "no vessel on a bench" in text]
+    assert "--unit cm (9.5 mm" in warning
+    assert not mended(glass(tmp_path / "glass.stl"), unit="mm", wall=None).warnings
+
+
+@pytest.mark.parametrize("drop", [False, True])
+def test_a_chamber_in_the_wall_is_no_body_to_leave_out(drop: bool, tmp_path: Path) -> None:
+    found = mended(glass(tmp_path / "double.stl", chamber=True), unit="mm", wall=None, drop_bodies=drop)
+    assert not any("separate body" in text for text in (*found.notes, *found.warnings))
+    assert capacity(found) == pytest.approx(311.0, rel=0.01)
+
+
+def test_a_vessel_file_may_have_the_name_of_its_scan(tmp_path: Path) -> None:
+    scan = glass(tmp_path / "glass.stl")
+    before = scan.read_bytes()
+    ended = CliRunner().invoke(app, ["vessel", "mesh", str(scan), str(tmp_path / "glass.yaml"), "--unit", "mm"])
+    assert ended.exit_code == 0, ended.output
+    assert scan.read_bytes() == before
+    assert "mesh: glass-repaired.stl" in (tmp_path / "glass.yaml").read_text(encoding="utf-8")
