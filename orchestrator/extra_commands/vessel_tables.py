@@ -162,6 +162,9 @@ def _read_rows(path: Path, column: str, *, upper: float, tare: float) -> list[tu
             raise RefusalError(f"{at}: should be two numbers, {column} and mass_g")
         values = {name.standard: n * name.factor for name, n in zip(columns, numbers, strict=True) if name is not None}
         value, mass = values[column], values["mass_g"] - tare
+        if value == 0.0 and (column == "tilt_deg" or mass == 0.0):
+            print_note(f"note: {at}: {column} 0 is left out: it says nothing about the shape")
+            continue
         if not 0.0 < value <= upper * (1.0 + 1e-9):
             raise RefusalError(f"{at}: {column} is {value:g}; should be above 0 and at most {upper:g}")
         if not 0.0 <= mass < 1e5:

@@ -163,6 +163,10 @@ def number_readings(text: str) -> tuple[str, ...]:
     return tuple(filter(None, [plain_number(text, decimal_comma=kind == ",")]))
 
 
+_SMALLER = {"g": "mg", "kg": "g", "m": "mm", "s": "ms", "L": "mL"}
+"""Units of a thousandth."""
+
+
 def typed_number(text: str, unit: str = "", *, largest: float = math.inf) -> Decimal:
     """The number that a person typed, with its digits.
 
@@ -184,9 +188,10 @@ def typed_number(text: str, unit: str = "", *, largest: float = math.inf) -> Dec
     if not possible:
         raise QuantityError(f"'{text}{unit}' is too much: at most {largest:g}{unit} is possible. Is the unit right?")
     fine, coarse = possible
-    raise QuantityError(
-        f"'{text}{unit}' may be {fine}{unit} or {coarse}{unit}; type '{fine}0{unit}' or '{coarse}{unit}'"
-    )
+    # with a smaller unit, so that no digit is added that nobody read
+    smaller = _SMALLER.get(unit.strip())
+    whole = f"{Decimal(fine).scaleb(3):f} {smaller}" if smaller else f"{fine}0{unit}"
+    raise QuantityError(f"'{text}{unit}' may be {fine}{unit} or {coarse}{unit}; type '{whole}' or '{coarse}{unit}'")
 
 
 def split_typed(text: str) -> tuple[str, str]:

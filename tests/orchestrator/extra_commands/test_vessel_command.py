@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from orchestrator.campaigns.file_loading import load_vessel
-from orchestrator.extra_commands.vessel_tables import read_fill_table
+from orchestrator.extra_commands.vessel_tables import read_fill_table, read_tilt_table
 from sim_engine.errors import DecantError
 from sim_engine.vessel.profile import volume
 from sim_engine.vessel.vessel import build_vessel
@@ -249,3 +249,16 @@ def test_fill_tables_are_read_in_the_forms_that_spreadsheets_save(
     european = table("# cup 7\n;Level [cm];mass (oz)\n" + "0;1,0;1,0758\n1;2,0;2,15169\n2;3,05;3,25402\n")
     assert european == [pytest.approx(column, rel=1e-3) for column in plain]
     assert "semicolons between cells, 1 comment line left out" in capsys.readouterr().err
+
+
+def test_a_first_row_upright_or_empty_is_left_out_with_a_note(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = tmp_path / "table.csv"
+    table.write_text("tilt_deg,mass_g\n0,200\n30,150\n50,90\n70,20\n", encoding="utf-8")
+    tilts, _ = read_tilt_table(table, angle=0.5, balance=0.1)
+    assert list(tilts) == [30.0, 50.0, 70.0]
+    table.write_text("level_mm,mass_g\n0,0\n20,40\n50,100\n90,200\n", encoding="utf-8")
+    levels, _ = read_fill_table(table, height=100.0, density=1e-3, ruler=0.5, balance=0.1)
+    assert levels[0] == 20.0
+    assert "tilt_deg 0 is left out" in capsys.readouterr().err

@@ -224,7 +224,7 @@ def test_a_content_that_can_not_be_meant_is_not_entered(mass: str, tmp_path: Pat
     expected = {
         "100000 kg": "'100000 kg' is too much: at most 20 kg is possible. Is the unit right?",
         "1,234 g": "'1,234 g' may be 1.234 g or 1234 g; type '1.2340 g' or '1234 g'",
-        "12.345 g": "'12.345 g' may be 12.345 g or 12345 g; type '12.3450 g' or '12345 g'",
+        "12.345 g": "'12.345 g' may be 12.345 g or 12345 g; type '12345 mg' or '12345 g'",
         "-1 g": "should be 0 g or more",
         "5 mL": "is a volume; should be a mass",
         "5": "has no unit",
