@@ -105,7 +105,7 @@ def walked(folder: Path, monkeypatch: pytest.MonkeyPatch, functions: set[str], l
     campaign = write_campaign(folder, ONE_POUR)
     with Walk(monkeypatch, functions, last) as walk:
         result = CliRunner().invoke(app, [words[0], str(campaign), "--in-process", *words[1:]])
-    assert result.exit_code == 0, result.output
+    assert result.exit_code in (0, 4), result.output  # a single pour by D2 recommends no action
     return set(walk.files) - EVERY_COMMAND
 
 

@@ -452,13 +452,16 @@ def test_every_arrival_of_a_real_balance_is_read(number):
 
 @pytest.mark.realtime
 def test_the_driver_reads_irregular_arrivals_in_their_order(tmp_path):
-    """Real readings, each as late as it was, twenty times as fast; the second one is the balance's tare."""
+    """Real readings, each as late as it was, twenty times as fast; the second one is the balance's tare.
+
+    The file of the readings has lost the zeros at their ends, which a display of two decimals shows.
+    """
     path = tmp_path / "arrivals.jsonl"
     series = arrivals(4)[:80]
     events = []
     for (before, _), (at, shown) in itertools.pairwise([(-0.1, ""), *series]):
         events.append(LineEvent(before + 0.11, "out", b"SI\r\n"))
-        events.append(LineEvent(at + 0.1, "in", f"S D {shown:>9} g\r\n".encode()))
+        events.append(LineEvent(at + 0.1, "in", f"S D {float(shown):9.2f} g\r\n".encode()))
     LineRecording("typed", tuple(sorted(events, key=lambda one: one.time))).save(path)
     far = RecordedBalance.start(path, speed=20.0)
     seen: dict[float, float] = {}

@@ -212,7 +212,7 @@ IN_DOUBT: dict[str, tuple[str | bytes, str]] = {
     "web page": (b"\xef\xbb\xbf<html><table><tr><td>1</td></tr></table></html>", "is a web page or XML, not a table"),
     "picture": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "pours.csv: is not text (byte 0)"),
     "half a workbook": (workbook(cells(PLAIN))[:900], "is a damaged workbook or archive"),
-    "broken sheet": (workbook(cells(PLAIN), "<row"), "is a workbook that can't be read (ParseError); save its first"),
+    "broken sheet": (workbook(cells(PLAIN), "<row"), "is a workbook that can't be read (ParseError); save the sheet"),
     "number as text": (
         workbook([[*HEADER.split(",")], ["fast", 95.0, 180.0, 4.25, 20.0, "train"]]),
         "pours.csv:2:1: angular_velocity_deg_s: 'fast' is not a number",
