@@ -45,6 +45,7 @@ from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.virtual_dosing_bench import TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseEnd
+from actors.runtime.child_process import child_environment
 from sim_engine.liquids import Liquid
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -282,7 +283,9 @@ def over_the_wires(count: int, seed: int = 3) -> list[dict[str, Any]]:
 
     with tempfile.TemporaryDirectory() as folder:
         os.environ["DECANT_STATE"] = str(Path(folder) / "state")
-        busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(BUSY)]
+        busy = [
+            subprocess.Popen([sys.executable, "-c", "while True: pass"], env=child_environment()) for _ in range(BUSY)
+        ]
         try:
             doses = asyncio.run(poured(Path(folder))).results["doses"]
         finally:

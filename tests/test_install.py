@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from actors.runtime.child_process import child_environment
 from tests.support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[1]
@@ -198,7 +199,12 @@ def test_a_disk_without_room_is_refused_before_anything_is_made(project: Path) -
         "sys.argv = ['install.py', 'program']; runpy.run_path('install.py', run_name='__main__')"
     )
     done = subprocess.run(
-        [sys.executable, "-c", limited], cwd=project, capture_output=True, text=True, timeout=PATIENCE
+        [sys.executable, "-c", limited],
+        cwd=project,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        env=child_environment(),
     )
     assert done.returncode == 2
     assert stopped(done.stderr) == f"{project} has 0.4 GB of free space, the environment needs 1.5 GB"
@@ -212,7 +218,12 @@ def test_a_python_without_ensurepip_is_named(project: Path) -> None:
         "sys.argv = ['install.py', 'program']; runpy.run_path('install.py', run_name='__main__')"
     )
     done = subprocess.run(
-        [sys.executable, "-c", without], cwd=project, capture_output=True, text=True, timeout=PATIENCE
+        [sys.executable, "-c", without],
+        cwd=project,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        env=child_environment(),
     )
     assert done.returncode == 2
     assert "makes no environments; on Debian and Ubuntu: apt install python3-venv" in stopped(done.stderr)

@@ -12,6 +12,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from actors.runtime.child_process import child_environment
 from orchestrator.daemon.state.access_tokens import Role
 from tests.support.daemon_thread import Real
 from tests.support.loopback import free_address
@@ -43,7 +44,8 @@ def proxied(tmp_path: Path) -> Iterator[tuple[Real, str]]:
         f"{user}pid {tmp_path}/pid;\nerror_log {tmp_path}/errors;\nevents {{}}\n"
         f"http {{\naccess_log off;\n{paths}{recipe(address, real.url)}}}\n"
     )
-    process = subprocess.Popen([nginx, "-p", str(tmp_path), "-c", str(tmp_path / "nginx.conf"), "-g", "daemon off;"])
+    command = [nginx, "-p", str(tmp_path), "-c", str(tmp_path / "nginx.conf"), "-g", "daemon off;"]
+    process = subprocess.Popen(command, env=child_environment())
     try:
         wait_for((tmp_path / "pid").exists)
         yield real, f"http://{address}:8080"

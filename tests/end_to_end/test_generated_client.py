@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from actors.interfaces import OperatorQuestion
+from actors.runtime.child_process import child_environment
 from orchestrator.daemon.state.access_tokens import Role
 from tests.support.browser import on_port
 from tests.support.toy_campaign import ToyOptimizer, ToySimulators
@@ -49,13 +50,14 @@ def test_a_generated_client_submits_a_shipped_campaign_and_reads_its_verdict(tmp
     with on_port(tmp_path / "daemon", asking) as lab:
         described = f"{lab.url}/api/v1/openapi.json"
         made = [generator, "generate", "--url", described, "--meta", "none", "--config", str(tmp_path / "name.json")]
-        subprocess.run([*made, "--output-path", str(tmp_path / "decant_client")], check=True, capture_output=True)
+        made += ["--output-path", str(tmp_path / "decant_client")]
+        subprocess.run(made, check=True, capture_output=True, env=child_environment())
         vessels = [f"../vessels/{name}.yaml" for name in ("beaker", "bowl")]
         files = {name: name for name in vessels} | {"../laboratories/ur10-kern.yaml": str(laboratory)}
         python = Path(generator).resolve().parent / "python"
         token = lab.served.tokens[Role.OPERATOR]
         command = [python, PROGRAM, lab.url, token, CAMPAIGN, json.dumps(files)]
-        environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        environment = {**child_environment(), "PYTHONPATH": str(tmp_path)}
         program = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400)
     assert program.returncode == 0, program.stderr
     ended = json.loads(program.stdout.splitlines()[-1])

@@ -211,7 +211,7 @@ def test_a_person_weighs_a_source_on_the_command_line_and_sees_what_is_left(
     assert "169.5 ± 0.1 g" in listed
     assert "bench/jar                water        30.5" in listed
     lines = invoke("materials list bench/beaker").stdout.splitlines()
-    assert [line.split()[2] for line in lines] == ["weighed", "poured"]
+    assert [line.split()[3] for line in lines] == ["weighed", "poured"]
     assert "Monday" in lines[0]
     assert VesselAccount.open().known(series())["beaker"].mass == pytest.approx(0.1695)
     refused = invoke("materials weigh beaker '200 g'")  # a vessel of the station: its daemon checks the entry
@@ -223,7 +223,7 @@ def test_a_person_weighs_a_source_on_the_command_line_and_sees_what_is_left(
 def test_a_content_that_can_not_be_meant_is_not_entered(mass: str, tmp_path: Path) -> None:
     expected = {
         "100000 kg": "'100000 kg' is too much: at most 20 kg is possible. Is the unit right?",
-        "1,234 g": "'1,234 g' may be 1.234 g or 1234 g; type '1.2340 g' or '1234 g'",
+        "1,234 g": "'1,234 g' may be 1.234 g or 1234 g; type '1234 mg' or '1234 g'",
         "12.345 g": "'12.345 g' may be 12.345 g or 12345 g; type '12345 mg' or '12345 g'",
         "-1 g": "should be 0 g or more",
         "5 mL": "is a volume; should be a mass",

@@ -250,7 +250,7 @@ def test_a_queue_of_another_format_is_refused_and_stays_as_it_is(tmp_path: Path,
         with pytest.raises(StoreError) as refused:
             Store(path)
         assert str(refused.value) == (
-            f"{path}: written in format {other}, this version of Decant reads format {STORE_FORMAT}; "
+            f"{path}: written in format {other}, this version of Decant reads formats 5 to {STORE_FORMAT}; "
             "use the version that wrote it, or name another folder with --state"
         )
     assert CliRunner().invoke(app, ["server", "start", "--state", str(tmp_path), "--port", "0"]).exit_code == 2

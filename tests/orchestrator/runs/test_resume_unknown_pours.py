@@ -175,5 +175,5 @@ def test_masses_are_read_as_they_were_typed(answer: str, spilled: float, retaine
 
 
 def test_a_mass_that_may_have_thousands_is_asked_for_again_if_the_load_allows_both() -> None:
-    with pytest.raises(ValueError, match=r"may be 1.234 g or 1234 g; type '1.2340 g' or '1234 g'"):
+    with pytest.raises(ValueError, match=r"may be 1.234 g or 1234 g; type '1234 mg' or '1234 g'"):
         parse_answer("weighed 1.234 0.4", (LOST, WEIGHED), 2.0)

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from actors import optimizer_actor as optimizer
-from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
+from actors.interfaces import InvalidActionError, LaboratoryError, PourProgress, SimulationError
 from actors.runtime.remote_object import DeviceLostError
 from orchestrator.learning.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Slots
 from orchestrator.learning.run_errors import RunError
@@ -330,7 +330,7 @@ def test_a_bench_that_calls_its_own_abortion_a_failure_does_not_make_it_known(tm
     laboratory = ToyLaboratory()
 
     async def sulk(scene: Any, action: Any, *, seed: int, progress: Any = None, dose: Any = None) -> Any:
-        progress(None)
+        progress(PourProgress("tilt", 0.0))
         try:
             await asyncio.sleep(60)  # it is cancelled here
         except asyncio.CancelledError:

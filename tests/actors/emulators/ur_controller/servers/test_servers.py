@@ -24,6 +24,7 @@ from actors.emulators.ur_controller.servers.dashboard_server import DashboardCon
 from actors.emulators.ur_controller.servers.primary_server import PrimaryConnection, PrimaryServer
 from actors.emulators.ur_controller.servers.rtde_server import RtdeConnection, RtdeServer
 from tests.support.hypothesis_examples import examples
+from tests.support.waiting import wait_for
 
 
 class _Socket:
@@ -486,8 +487,7 @@ def test_a_program_that_can_not_be_run_is_reported_on_the_port_it_came_by(text: 
     wire = Wire(_primary(controller))
     wire.take()
     wire.say(text.encode())
-    controller.tick()
-    errors = reported(wire)
+    errors = wait_for(lambda: controller.tick() or reported(wire))  # another thread translates the program
     assert any(error.startswith(says) for error in errors), errors
     assert not controller.playing
 
