@@ -71,9 +71,8 @@ class Wire(asyncio.Transport):
             self._connection.data_received(data)
             uploads = self._connection.connections.uploads
             uploads.work(1.0)  # as the host does at its next wake-up
-            if uploads.translating:
-                wait_for(lambda: not uploads.translating, "translation")
-                uploads.work(1.0)
+            wait_for(lambda: not uploads.translating, "translation of a long program")
+            uploads.work(1.0)
 
     def take(self) -> bytes:
         data = bytes(self.got)
