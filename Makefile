@@ -41,9 +41,15 @@ lint: $(READY)-test
 unit: $(READY)-test
 	$(BIN)/pytest -m "not slow and not physics" -n 4 --timeout 300 $(BY_FILE)
 
+# Generates a client of the service from its description; its own environment, since it pins older packages.
+GENERATOR := build/openapi/bin/openapi-python-client
+$(GENERATOR): $(READY)
+	$(BIN)/python -m venv build/openapi
+	build/openapi/bin/python -m pip install --quiet --disable-pip-version-check openapi-python-client==0.29.1
+
 # What takes long, and every property on four times as many examples. DECANT_TESTS_PART=2/4 runs every fourth file.
-slow: $(READY)-test
-	DECANT_THOROUGH=1 $(BIN)/pytest -m "(slow or hypothesis) and not physics" -n 2 $(BY_FILE)
+slow: $(READY)-test $(GENERATOR)
+	DECANT_OPENAPI_CLIENT=$(abspath $(GENERATOR)) DECANT_THOROUGH=1 $(BIN)/pytest -m "(slow or hypothesis) and not physics" -n 2 $(BY_FILE)
 
 # Every criterion of the solver's full cases, about half an hour. Near a limit the processor's rounding decides.
 physics: $(READY)-test

@@ -41,7 +41,7 @@ def asking() -> HeldLaboratory:
 def test_a_generated_client_submits_a_shipped_campaign_and_reads_its_verdict(tmp_path: Path) -> None:
     generator = os.environ.get("DECANT_OPENAPI_CLIENT") or shutil.which("openapi-python-client")
     if generator is None:
-        pytest.skip("no client was generated: pip install openapi-python-client, or $DECANT_OPENAPI_CLIENT")
+        pytest.skip("no client was generated: `make slow` installs the generator, or $DECANT_OPENAPI_CLIENT names it")
     laboratory = tmp_path / "at-the-bench.yaml"
     laboratory.write_text(AT_THE_BENCH, encoding="utf-8")
     (tmp_path / "name.json").write_text(

@@ -39,4 +39,4 @@ stream = events.sync_detailed(client=client, campaign=first.id, after=0, until=T
 assert stream.parsed.count("event: QuestionAnswered") == answered
 assert "decant_pours_total" in metrics.sync(client=client)
 assert report.sync(first.id, client=client).lstrip().startswith("<!")
-print(json.dumps({"state": item.state, "reason": item.reason, "verdict": item.verdict, "answered": answered}))
+print(json.dumps({"state": item.state, "reason": item.reason, "verdict": item.verdict.word, "answered": answered}))
