@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import time
@@ -12,9 +13,8 @@ from typing import Any
 
 import pytest
 
-from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.daemon.api.daemon_client import Client
-from orchestrator.daemon.rigs.submissions import pack
+from orchestrator.daemon.rigs.submissions import pack_unresolved
 from orchestrator.records.journal import JournalReader
 from tests.support import small_campaign
 from tests.support.command_process import PATIENCE, Workplace, ended, finished_in, logical
@@ -58,7 +58,8 @@ def test_two_rigs_of_a_daemon_share_the_simulators_of_a_cluster_that_loses_a_nod
         (tmp_path / f"{rig}.yaml").write_text(LABORATORY.replace("NAME", rig))
     settings = {"rigs": {rig: f"{rig}.yaml" for rig in rigs}, "ray": {"address": cluster.address}}
     (tmp_path / "daemon.yaml").write_text(json.dumps(settings))
-    text, files = pack(load_campaign(small_campaign.write_campaign(tmp_path, CAMPAIGN)))
+    anywhere = re.sub(r"laboratory:\n(  .*\n)+", "", CAMPAIGN)  # it runs on each rig as it is
+    text, files = pack_unresolved(small_campaign.write_campaign(tmp_path, anywhere))
     place = Workplace(tmp_path, cluster.environment)
     state = tmp_path / "state"
     process = place.start("server", "start", "daemon.yaml", "--state", str(state), "--port", "0")

@@ -119,18 +119,17 @@ def _packed(value: Any, files: Files) -> Any:
 
 
 def _taken(path: Path, files: Files) -> str:
-    if path.parts[:2] == ("/", "dev"):  # a port of a laboratory's device
+    is_run = (path / JOURNAL_NAME).is_file()
+    if not is_run and not path.is_file():  # nothing is read, as of the port of a device
         return str(path)
     if (outside := out_of_bounds(path)) is not None:
         raise ConfigError([Problem(path, 0, 0, "", outside)])
     stem = re.sub(r"[^A-Za-z0-9._-]", "_", re.sub(r"^\d+-", "", path.name)).lstrip("._-")[-60:] or "file"
     name = f"files/{len(files) + 1}-{stem}"
-    if (path / JOURNAL_NAME).is_file():  # a previous run: only its journal is read
+    if is_run:  # only the journal of a previous run is read
         files[f"{name}/{JOURNAL_NAME}"] = _coded(whole_copy(path / JOURNAL_NAME))
-    elif path.is_file():
-        files[name] = _coded(path.read_bytes())
     else:
-        return str(path)
+        files[name] = _coded(path.read_bytes())
     return name
 
 
