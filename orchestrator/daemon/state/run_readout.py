@@ -130,8 +130,8 @@ def verdict_at(directory: Path) -> dict[str, Any] | None:
     """Return the verdict of a run, JSON-ready; None if its journal can't be read."""
     try:
         return verdict_of(read_record(directory)).model_dump(mode="json")
-    except (JournalError, CodecError, OSError) as error:
-        _log.warning("%s: no verdict: %s", directory.name, error)
+    except Exception as error:  # damaged content can cause any error, and must not end the work of a rig
+        _log.warning("%s: no verdict: %s: %s", directory.name, type(error).__name__, error)
         return None
 
 
