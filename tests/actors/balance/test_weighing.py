@@ -160,9 +160,9 @@ def test_a_weight_with_two_meanings_is_shown_with_both_and_asked_for_again(virtu
     wiped, after = ["1,234 g", "1.234 g", "1234 g"], ["1,250 g", "1,25 kg"]
     (measured,), operator = play(virtual, Placement.MANUAL, {"Wipe the tray": wiped, "Weigh the tray": after})
     assert [q.problem for q in operator.asked if q.problem] == [
-        "'1,234 g' may be 1.234 g or 1234 g; type '1.2340 g' or '1234 g'",
-        "'1.234 g' may be 1.234 g or 1234 g; type '1.2340 g' or '1234 g'",
-        "'1,250 g' may be 1.250 g or 1250 g; type '1.2500 g' or '1250 g'",
+        "'1,234 g' may be 1.234 g or 1234 g; type '1234 mg' or '1234 g'",
+        "'1.234 g' may be 1.234 g or 1234 g; type '1234 mg' or '1234 g'",
+        "'1,250 g' may be 1.250 g or 1250 g; type '1250 mg' or '1250 g'",
     ]
     assert measured.spilled == pytest.approx(0.016)
 

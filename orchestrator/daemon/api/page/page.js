@@ -124,7 +124,7 @@ function link(up) {
   const changed = up !== now.up;
   now.up = up;
   const person = now.status?.person;
-  $("link").textContent = up ? `connected, ${clock(now.heard / 1000)}${person ? `, ${person.name} (${person.role})` : ""}` : "NO CONNECTION";
+  $("link").replaceChildren(...(up ? [`connected, ${clock(now.heard / 1000)}`, el("span", { class: "words" }, person ? `, ${person.name} (${person.role})` : "")] : ["NO CONNECTION"]));
   if (!changed) return;
   $("lost").hidden = up;
   $("lost").replaceChildren(...(up ? [] : [
