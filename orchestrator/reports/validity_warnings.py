@@ -133,17 +133,21 @@ def worked_out(
 
 
 def not_simulated(plan: CampaignPlan, tell: Callable[[str], None]) -> list[str]:
-    """Effects that are not simulated in a campaign's action spaces: lines for the user before it begins.
+    """Effects that are not simulated in most of a campaign's action spaces: lines for the user before it begins.
+
+    An effect in the minority of the actions tried is in the report only: the search may never go there, and the
+    recommended action has warnings of its own.
 
     Args:
         plan: of the campaign.
         tell: called if that can't be worked out.
     """
-    warnings = worked_out(lambda: campaign_warnings(plan), tell)
+    by_scene = worked_out(lambda: campaign_warnings(plan), tell)
+    warnings = [gap for gap in itertools.chain.from_iterable(by_scene.values()) if 2 * gap.hit > gap.tried]
     if not warnings:
         return []
     texts = ["not simulated (docs/explanation/simulator.md has what to do):"]
-    for warning in itertools.chain.from_iterable(warnings.values()):
+    for warning in warnings:
         at = f"(at {style.display_values(warning.action_si)}; {warning.hit} of {warning.tried} actions tried)"
         texts.append(f"  into {warning.receiver}, {warning.kind}: {warning.text} {at}")
     return texts

@@ -66,6 +66,13 @@ def test_a_warning_names_the_worst_action_and_how_many_were_tried() -> None:
     assert any("max angle 66 deg" in line for line in told)
 
 
+def test_the_quickstart_begins_without_a_warning_and_its_report_has_those_of_the_corners() -> None:
+    plan = load_campaign(CAMPAIGNS / "quickstart.yaml")
+    assert not_simulated(plan, print) == []
+    ((corner,),) = campaign_warnings(plan).values()
+    assert (corner.kind, corner.hit, corner.tried) == ("thin_stream", 2, 5)
+
+
 def test_a_viscous_liquid_is_told_by_its_viscosity_alone() -> None:
     (warnings,) = campaign_warnings(deploying(QUICK, dynamic_viscosity=3.0)).values()
     assert [one.kind for one in warnings] == ["viscous"]
