@@ -331,6 +331,20 @@ class RiskAnswer:
 
 
 @dataclass(frozen=True)
+class Equality:
+    """When a recommended point is equal to others, so that the gentlest of them is taken.
+
+    Attributes:
+        tolerance: points whose posterior means are larger than the smallest one by at most this are equal; a smallest
+            one below all observed costs counts as the smallest of these.
+        speed: name of the axis on which smaller values are gentler; '' without any.
+    """
+
+    tolerance: float
+    speed: str
+
+
+@dataclass(frozen=True)
 class SpaceFillingQuery:
     """Points that fill the space evenly, far from known ones: the start of a search, without a surrogate.
 
@@ -376,6 +390,7 @@ class SurrogateQuery:
         failed: places of real requests that failed during execution, for example because the vessels touched. They are
             among `data` too, with the cost of the failure. Proposals avoid places with a likely failure, and the best
             point is one that is likely to succeed.
+        equality: the best point is the gentlest of equal ones; None: the minimiser.
     """
 
     space: Space
@@ -390,6 +405,7 @@ class SurrogateQuery:
     infeasible: tuple[Point, ...] = ()
     refused: tuple[Point, ...] = ()
     failed: tuple[Point, ...] = ()
+    equality: Equality | None = field(default=None, metadata=WRITTEN_IF_SET)
 
     @property
     def context_dimension(self) -> int:
@@ -548,7 +564,8 @@ class Suggestion:
         best_point: minimiser of the posterior mean over the observed points (the simulated ones if there are no
             others), except those that were refused or probably are. After failures, the minimised quantity is the
             expectation with a failure of the estimated probability, at the largest observed cost. With a risk: the
-            minimiser over `predict_at`, because requests differ from the observed points. None without a surrogate.
+            minimiser over `predict_at`, because requests differ from the observed points. With
+            `SurrogateQuery.equality`: the gentlest of equal points. None without a surrogate.
         best_mean: posterior mean there.
         best_deviation: its standard deviation.
         hyperparameters: fitted values by name (for reports and plots); 'noise' and 'signal' in the cost's unit.
@@ -570,6 +587,8 @@ class Suggestion:
             candidate, averaged over the targets; in the cost's unit, squared.
         uncertainty: with a `DesignQuestion`: the current variance, averaged over the targets.
         discrepancy: with a `ModelDiscrepancy`: the conclusions about the simulator.
+        equal_ranges: with `SurrogateQuery.equality`: by axis, the ends of the interval around `best_point` in which
+            the points are equal to it, the other axes held; in the unit cube.
     """
 
     points: tuple[Point, ...]
@@ -592,3 +611,4 @@ class Suggestion:
     gains: tuple[float, ...] = ()
     uncertainty: float | None = None
     discrepancy: DiscrepancyFound | None = None
+    equal_ranges: tuple[tuple[float, float], ...] | None = field(default=None, metadata=WRITTEN_IF_SET)

@@ -11,7 +11,7 @@ import itertools
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,8 +77,16 @@ def describe(
         probability = feasibility.made(known)
         expected = probability * at_known + (1.0 - probability) * arrays.costs.max()
     best = int(np.argmin(expected))
+    description: dict[str, object] = {}
+    if query.equality is not None and not risky:
+        # between observations a surrogate falls below every cost, which makes no point better than the best observed
+        observed = arrays.costs if len(arrays.costs) else arrays.simulated_costs
+        limit = max(float(expected[best]), float(observed.min())) + query.equality.tolerance
+        equal = _EqualPoints(limit, query.equality.speed, query.space.names, arrays.region, model, feasibility)
+        best = equal.gentlest(known, expected, query.seed)
+        description["equal_ranges"] = equal.ranges(known[best])
     process = model.process
-    description: dict[str, object] = {
+    description |= {
         "means": tuple(map(float, means)),
         "deviations": tuple(map(float, deviations)),
         "noises": () if other_space else tuple(map(float, model.noise_at(points))),
@@ -111,6 +119,68 @@ def describe(
         across, up = sorted(int(i) for i in np.argsort(model.lengths, kind="stable")[:2])
         description["surrogate"] = mapped(query, arrays.region, model, at, (across, up), query.map_resolution)
     return description
+
+
+EQUAL_PLACES = 1024
+"""Number of points of the region by which its equal part is known."""
+
+EQUAL_STEPS = 101
+"""Number of places along an axis at which equality is tested."""
+
+
+@dataclass(frozen=True)
+class _EqualPoints:
+    """The points of a region whose expected cost is equal to the smallest one.
+
+    Attributes:
+        limit: largest expected cost that counts as equal.
+        speed: see `Equality`.
+    """
+
+    limit: float
+    speed: str
+    names: Sequence[str]
+    region: Region
+    model: Model
+    feasibility: Feasibility | None
+
+    def gentlest(self, known: Array, expected: Array, seed: int) -> int:
+        """Index of the gentlest of the observed points (n, dimension) with an expected cost (n,) equal to the smallest.
+
+        It is no faster than the middle of the equal part of the region, if possible, and the nearest to this middle.
+        """
+        equal = np.flatnonzero(expected <= self.limit)
+        places = self.region.draw(EQUAL_PLACES, np.random.default_rng(seed), even=True)
+        middle = np.concatenate([known[equal], places[self._equal(places)]]).mean(axis=0)
+        candidates = equal
+        if self.speed:
+            speed = self.names.index(self.speed)
+            slow = equal[known[equal, speed] <= middle[speed]]
+            candidates = slow if len(slow) else equal
+        return int(candidates[np.argmin(((known[candidates] - middle) ** 2).sum(axis=1))])
+
+    def ranges(self, point: Array) -> tuple[tuple[float, float], ...]:
+        """By axis, the ends of the equal interval around a point (dimension,)."""
+        ends = []
+        for axis in range(len(point)):
+            steps = np.unique(np.append(np.linspace(0.0, 1.0, EQUAL_STEPS), point[axis]))
+            line = np.tile(point, (len(steps), 1))
+            line[:, axis] = steps
+            at = int(np.searchsorted(steps, point[axis]))
+            equal = self._equal(line)
+            equal[at] = True
+            below, above = np.flatnonzero(~equal[:at]), np.flatnonzero(~equal[at:])
+            first = int(below[-1]) + 1 if len(below) else 0
+            last = at + int(above[0]) - 1 if len(above) else len(steps) - 1
+            ends.append((float(steps[first]), float(steps[last])))
+        return tuple(ends)
+
+    def _equal(self, points: Array) -> NDArray[np.bool_]:
+        """Which points (m, dimension) are equal to the minimiser: (m,)."""
+        snapped = self.region.snap(points)
+        means = self.model.surrogate.predict(snapped)[0]
+        equal = self.region.allows(snapped) & (means <= self.limit)
+        return equal if self.feasibility is None else equal & self.feasibility.likely(snapped)
 
 
 def _announces_pours(query: SurrogateQuery) -> bool:

@@ -15,7 +15,8 @@ from actors.dosing.dose_series import LOST
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory, MemoryFound
 from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan
-from orchestrator.learning.deployment.deployment_result import RiskFound
+from orchestrator.learning.deployment.deployment_ledger import EQUAL_LOSS
+from orchestrator.learning.deployment.deployment_result import Recommended, RiskFound
 from orchestrator.learning.deployment.model_monitoring import DOUBT, Believed
 from orchestrator.learning.deployment.real_pours import PredictionCheck
 from orchestrator.learning.dispense import Dispensed
@@ -112,6 +113,7 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
         mean = unit.text(expected.predicted_loss, expected.predicted_deviation)
         scatter = unit.scatter(expected.predicted_scatter).removeprefix(", a pour ")
         lines.append(f"Expect {unit.meaning} of {mean}{scatter and f'; single pours differ from that by {scatter}'}.")
+        lines += _equally_good(expected)
     if row.prediction is not None:
         lines.append(_prediction(row))
     if row.prediction_interval is not None:
@@ -135,6 +137,17 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
     if _is_confirmed(row) and (trust := trust_line(row.model_check)) is not None:
         lines.append(_sentence(trust))
     return lines
+
+
+def _equally_good(recommended: Recommended) -> list[str]:
+    """'Equally good … x offset 90 … 110 mm', the ranges that are wider than a value."""
+    ranges = recommended.equal_ranges or {}
+    wide = {name: style.display_interval(name, *ends) for name, ends in ranges.items() if ends[0] < ends[1]}
+    if not wide:
+        return []
+    listed = ", ".join(f"{name.replace('_', ' ')} {text}" for name, text in wide.items())
+    within = f"to {100 * EQUAL_LOSS:.1f} % of the load"
+    return [f"Equally good {within}, one changed at a time: {listed}. Of these, a slow one near the middle was taken."]
 
 
 def _prediction(row: ReceiverSummary) -> str:

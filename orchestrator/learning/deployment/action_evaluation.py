@@ -60,6 +60,7 @@ class SeedMean:
 
     def regression(self, **parts: Any) -> RegressionQuery | RiskQuery:
         """A query about all simulations, without a proposal."""
+        parts["equality"] = self._requests.equality
         return self._requests.query(RegressionQuery, self._data(everything=True), **parts)
 
     def _data(self, *, everything: bool) -> Data:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from actors.optimizer.questions import MinimumQuery, RegressionQuery
 from orchestrator.learning.campaign_plan import DeploymentPlan
@@ -52,9 +52,10 @@ class RealOnly(Deployment[D2Settings]):
             else:
                 self._questions.put(self._about(MinimumQuery), "pour", self._pour_first)
         else:
-            self._questions.put(self._about(RegressionQuery), "conclude", self._conclude)
+            conclusion = self._about(RegressionQuery, equality=self._requests.equality)
+            self._questions.put(conclusion, "conclude", self._conclude)
 
-    def _about(self, kind: type[MinimumQuery | RegressionQuery]) -> MinimumQuery | RegressionQuery:
+    def _about(self, kind: type[MinimumQuery | RegressionQuery], **parts: Any) -> MinimumQuery | RegressionQuery:
         """A query about the real cost."""
         real = self._ledger.real()
-        return self._requests.query(kind, real, mean=self._settings.mean, map_resolution=MAP_RESOLUTION)
+        return self._requests.query(kind, real, mean=self._settings.mean, map_resolution=MAP_RESOLUTION, **parts)

@@ -153,7 +153,8 @@ class Hybrid(Deployment[D3Settings]):
         elif self._choice.left:
             self._next_pour()
         else:
-            self._questions.put(self._choice.query(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._conclude)
+            parts = {"map_resolution": MAP_RESOLUTION, "equality": self._requests.equality}
+            self._questions.put(self._choice.query(count=0, **parts), "conclude", self._conclude)
 
     def _simulations_before(self) -> int:
         """Number of simulations before the first pour, as far as known: with 'adaptive', one third of the usual number

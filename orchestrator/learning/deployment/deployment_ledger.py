@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
-from actors.optimizer.questions import Data, Point, SpaceFillingQuery, SurrogateQuery
+from actors.optimizer.questions import Data, Equality, Point, SpaceFillingQuery, SurrogateQuery
 from orchestrator.learning.calibration.calibration_base import Kappa
 from orchestrator.learning.campaign_plan import DeploymentPlan, DeploymentSettings, Draw
 from orchestrator.learning.deployment.costing import Costing
@@ -30,6 +30,10 @@ MAX_REFUSED = 20
 """Number of refused actions (touching vessels, out of reach) that are free: pours before a strategy gives up, and
 simulations before further ones count against the budget."""
 
+
+EQUAL_LOSS = 0.002
+"""Difference of two expected losses, as a share of the load, below which the actions are equally good: less than the
+scatter from pour to pour on any bench so far."""
 
 GOLDEN_RATIO = 0.6180339887498949
 """Multiples of it modulo 1 cover the unit interval evenly, however many there are."""
@@ -232,6 +236,14 @@ class DeploymentRequests:
         if isinstance(settings, SearchSettings):
             parts["kappa"] = settings.kappa
         return kind(self._plan.actions, data, **self._limits(everything), **parts)
+
+    @property
+    def equality(self) -> Equality | None:
+        """When a recommended action is equal to a gentler one; None with objectives, which weigh speed themselves."""
+        if self._plan.objectives is not None:
+            return None
+        speed = "angular_velocity" if "angular_velocity" in self._plan.actions.names else ""
+        return Equality(EQUAL_LOSS * self.ledger.costing.everything_spilled, speed)
 
     def space_filling(self, **parts: Any) -> SpaceFillingQuery:
         """A query for points that fill the space of actions."""

@@ -40,6 +40,9 @@ class Recommended(ResultPart):
     hyperparameters: dict[str, float] | None = None
     """Those of the surrogate."""
 
+    equal_ranges: dict[str, tuple[float, float]] | None = None
+    """Ends of the ranges in which the expected loss is as small [SI], one dimension changed at a time."""
+
     @classmethod
     def of(
         cls, final: Suggestion, actions: Space, scatter: float | None, spillage: SampleStatistics | None
@@ -64,6 +67,12 @@ class Recommended(ResultPart):
             predicted_spillage=None if spillage is None else spillage.mean,
             predicted_spillage_deviation=None if spillage is None else spillage.deviation,
             hyperparameters=final.hyperparameters,
+            equal_ranges=None
+            if final.equal_ranges is None
+            else {
+                axis.name: (axis.decode(low), axis.decode(high))
+                for axis, (low, high) in zip(actions.axes, final.equal_ranges, strict=True)
+            },
         )
 
 

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 from actors.optimizer.questions import (
     CalibrationQuery,
     Data,
+    Equality,
+    Linear,
     MinimumQuery,
     PourQuery,
     RegressionQuery,
@@ -302,3 +304,46 @@ def test_asked_plainly_it_does_not_leave_the_bound_to_fill_space_on_a_plateau():
         return (answer.means[0] - 2.0 * answer.deviations[0] - bound.min()) / np.std(costs)
 
     assert excess(plain=True) < 0.01 < excess(plain=False)
+
+
+# -- equal points ----------------------------------------------------------------------------------------------------
+
+
+def plateau(points):
+    """Nothing is lost for x in 0.3 … 0.9 and y in 0.2 … 0.7; a little less by chance at the fast end."""
+    points = np.asarray(points)
+    outside = np.maximum(np.maximum(0.3 - points[:, 0], points[:, 0] - 0.9), 0.0)
+    outside += np.maximum(np.maximum(0.2 - points[:, 1], points[:, 1] - 0.7), 0.0)
+    return outside - 1e-2 * points[:, 0]
+
+
+def test_of_points_that_lose_equally_little_the_slower_one_near_the_middle_is_best():
+    points = [(x, y) for x in np.linspace(0.0, 1.0, 11) for y in np.linspace(0.0, 1.0, 6)]
+    query = RegressionQuery(PLANE, data_of(points, plateau(points)))
+    least = propose(query)
+    gentle = propose(replace(query, equality=Equality(0.02, "x")))
+    assert least.best_point[0] > 0.7
+    assert least.equal_ranges is None
+    assert 0.4 <= gentle.best_point[0] <= 0.61
+    assert gentle.best_point[1] == pytest.approx(0.4)
+    (left, right), (low, high) = gentle.equal_ranges
+    assert (left, right) == pytest.approx((0.3, 0.9), abs=0.05)
+    assert (low, high) == pytest.approx((0.2, 0.7), abs=0.08)
+
+
+def test_equal_points_keep_constraints_and_stay_away_from_refused_places():
+    points = [(x, y) for x in np.linspace(0.0, 1.0, 11) for y in np.linspace(0.0, 1.0, 6)]
+    refused = tuple((x, y) for x in (0.3, 0.4, 0.5) for y in (0.2, 0.4, 0.6))
+    query = RegressionQuery(PLANE, data_of(points, plateau(points)), equality=Equality(0.02, "x"), refused=refused)
+    assert propose(query).best_point[0] >= 0.6
+    bound = replace(query, refused=(), constraints=(Linear((("y", 1.0),), 0.45),))
+    answer = propose(bound)
+    assert answer.best_point[1] <= 0.45
+    assert answer.equal_ranges[1][1] <= 0.45
+
+
+@pytest.mark.parametrize("speed", ["x", "y", ""])
+def test_an_only_valley_is_recommended_whatever_counts_as_equal(speed):
+    points = cover(30)
+    query = RegressionQuery(PLANE, data_of(points, bowl(points)))
+    assert propose(replace(query, equality=Equality(1e-6, speed))).best_point == propose(query).best_point

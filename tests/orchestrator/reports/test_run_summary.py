@@ -68,6 +68,12 @@ def test_summary_tells_theta_discrepancies_losses_actions_and_files(results: dic
     assert display_values(deployed.recommended.action_si) in text
     assert "campaign.rrd" in text
 
+    ranges = {"angular_velocity": (1.0, 2.0), "x_offset": (0.1, 0.1)}
+    wide = changed(deployed, recommended=changed(deployed.recommended, equal_ranges=ranges))
+    text = shown(summary_table(summarise(plan, {**results, "narrow cup": wide})))
+    said = "Equally good to 0.2 % of the load, one changed at a time: angular velocity 57.3 … 115 deg/s."
+    assert said in " ".join(text.split())
+
 
 def test_a_memory_that_the_pours_contradict_is_an_open_question_of_the_run(results: dict[str, Any]) -> None:
     group = MemoryGroup(

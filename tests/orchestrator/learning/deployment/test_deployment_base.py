@@ -245,3 +245,21 @@ def test_an_answer_nobody_asked_for_is_refused():
     strategy = make("D3")
     with pytest.raises(ValueError, match="not asked for"):
         strategy.tell(Pour("cup", SCENE.action({"angular_velocity": 1.0}), 1, 1), Poured(PourMeasurement(1, 0, 0)))
+
+
+def wide_region(action, _, rng):
+    """Nothing is lost between 40 and 110 deg/s, except for scatter; a little less at the fast end."""
+    speed = math.degrees(action.angular_velocity)
+    lost = 0.005 * max(40.0 - speed, speed - 110.0, 0.0)
+    return float(np.clip(lost + 1e-5 * (120.0 - speed) + 2e-4 * abs(rng.standard_normal()), 0.0, 1.0))
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_of_actions_that_lose_nothing_a_slow_one_is_recommended_with_the_width_of_the_region(name):
+    strategy = make(name, seed=1, pours=10)
+    StrategyHarness(wide_region).run(strategy)
+    recommended = strategy.result().recommended
+    low, high = recommended.equal_ranges["angular_velocity"]
+    assert math.degrees(high - low) > 30.0
+    assert low <= recommended.action_si["angular_velocity"] <= low + 0.62 * (high - low)
+    assert recommended.predicted_loss < 0.005
