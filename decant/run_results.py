@@ -19,6 +19,7 @@ from orchestrator.learning.campaign_plan import CampaignPlan, receiver_names
 from orchestrator.learning.deployment.deployment_result import Recommended
 from orchestrator.learning.requests import Failed, Simulate, Simulated
 from orchestrator.learning.stage_result import UNIT_SUFFIXES, displayed_action
+from orchestrator.learning.strategy import plural
 from orchestrator.records.codec import Results
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.run_record import CampaignResult, Row, answers, read_record, read_result
@@ -185,7 +186,7 @@ class Run:
     def _repr_html_(self) -> str:
         """Campaign, folder and recommended actions, in notebooks."""
         rows = [("campaign", self.campaign.name), ("verdict", self.verdict.text), ("folder", str(self.directory))]
-        rows.append(("done", f"{self.result.pours} pours, {self.result.simulations} simulations"))
+        rows.append(("done", f"{plural(self.result.pours, 'pour')}, {plural(self.result.simulations, 'simulation')}"))
         for name, action in self.recommended.items():
             rows.append((f"recommended for {name}", described(action.action_si)))
         return html_table(rows)

@@ -26,6 +26,7 @@ from orchestrator.learning.calibration.campaign_memory import PLACEMENT, Weighed
 from orchestrator.learning.campaign_plan import MeasuredPour, RecordedPour
 from orchestrator.learning.deployment.calibration_evidence import weighed_pairs
 from orchestrator.learning.run_errors import RunError
+from orchestrator.learning.strategy import plural
 from orchestrator.records.codec import from_json
 from orchestrator.records.run_record import RunState, read_record
 from orchestrator.records.run_registry import make_state_directory, state_directory
@@ -188,7 +189,7 @@ class PosteriorAge(BaseModel):
             return ""
         day = time.strftime("%Y-%m-%d", time.localtime(self.since))
         off = f"since {day} later pours disagree by {self.deviations:+.1f} standard deviations"
-        return f"{off}; a calibration with {self.renewing_pours} pours would renew it"
+        return f"{off}; a calibration with {plural(self.renewing_pours, 'pour')} would renew it"
 
 
 def age_of(known: KnownPosterior, made: float, charts: Iterable[LaboratoryChart]) -> PosteriorAge:

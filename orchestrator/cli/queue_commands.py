@@ -237,6 +237,8 @@ def list_campaigns(key: CampaignOrAll = None, url: Url = None, state: State = No
 
 
 def _standing(item: dict[str, Any]) -> str:
+    from orchestrator.learning.strategy import plural
+
     progress = item["progress"]
     if progress is None:
         reason = str(item["reason"]).split("\n", maxsplit=1)[0][:100]
@@ -249,9 +251,9 @@ def _standing(item: dict[str, Any]) -> str:
         return " · ".join(filter(None, (verdict, reason, waits_for and f"waits for: {waits_for}")))
     parts = [f"{progress['stage']} ({progress['stage_index']}/{progress['stage_count']})"] if progress["stage"] else []
     if progress["of_pours"]:
-        parts.append(f"{progress['pours']}/{progress['of_pours']} pours")
+        parts.append(f"{progress['pours']}/{plural(progress['of_pours'], 'pour')}")
     if progress["of_simulations"]:
-        parts.append(f"{progress['simulations']}/{progress['of_simulations']} simulations")
+        parts.append(f"{progress['simulations']}/{plural(progress['of_simulations'], 'simulation')}")
     parts += [progress["checkpoint_words"]] if progress["checkpoint_words"] else []
     return " · ".join(parts)
 

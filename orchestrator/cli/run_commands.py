@@ -217,6 +217,8 @@ def chart_command(
 @_command("decant runs show quickstart-20300301-1")
 def show(run: Which, state: State = None, as_json: Json = False) -> None:
     """Show one run: state, θ*, recommendations, pours, notes, and files."""
+    from orchestrator.learning.strategy import plural
+
     with _catalogue() as catalogue, _refusing():
         entry = catalogue.run(run)
     if as_json:
@@ -230,7 +232,7 @@ def show(run: Which, state: State = None, as_json: Json = False) -> None:
         "campaign": f"{entry['campaign']}, seed {entry['seed']}, laboratory {entry['laboratory']}",
         "strategies": ", ".join(entry["strategy"]),
         "liquid": "{}, from {} into {}".format(*(", ".join(entry[key]) for key in ("liquid", "pourer", "receiver"))),
-        "work": f"{entry['simulations']} simulations, {_count_of_pours(entry)} pours, "
+        "work": f"{plural(entry['simulations'], 'simulation')}, pours: {_count_of_pours(entry)}, "
         f"{entry['spilled_g'] or 0:.1f} g spilled",
         "θ*": ", ".join(f"{key} {value:.4g}" for key, value in entry["theta"].items()),
         "test |Δ|": _percent(entry["test_discrepancy"]),

@@ -25,6 +25,7 @@ from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import WRITTEN_IF_SET, BenchOffset, CalibrationPours, Linear, Point
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory
 from orchestrator.learning.deployment.objectives import Objectives
+from orchestrator.learning.strategy import plural
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import MINIMUM_POURED, Loss
@@ -171,7 +172,7 @@ class DeploymentSettings(StrategySettings):
     @property
     def spending(self) -> str:
         """The budget per receiver, as text."""
-        return f"{self.pours} pours"
+        return plural(self.pours or 0, "pour")
 
     @abstractmethod
     def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:

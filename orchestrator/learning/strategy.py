@@ -19,19 +19,30 @@ from orchestrator.learning.stage_result import StageResult
 from sim_engine.outcome import Fractions
 
 
+def plural(count: int, noun: str) -> str:
+    """A count in words: '1 pour', '3 pours'."""
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
 @dataclass(frozen=True)
 class Progress:
     """Number of requests answered and in total.
 
     Attributes:
-        simulations, of_simulations: simulations answered, and in total.
-        pours, of_pours: pours made, and in total.
+        simulations, of_simulations: simulations answered, and in total; the total is at least those answered.
+        pours, of_pours: pours made, and in total, likewise.
+        limited: whether the totals are limits: the strategy ends as soon as no further request is worth its time.
     """
 
     simulations: int = 0
     of_simulations: int = 0
     pours: int = 0
     of_pours: int = 0
+    limited: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "of_simulations", max(self.of_simulations, self.simulations))
+        object.__setattr__(self, "of_pours", max(self.of_pours, self.pours))
 
     @property
     def simulations_left(self) -> int:
@@ -59,16 +70,19 @@ class Progress:
             self.of_simulations + other.of_simulations,
             self.pours + other.pours,
             self.of_pours + other.of_pours,
+            self.limited or other.limited,
         )
 
     def __str__(self) -> str:
-        """'3/6 pours · 20/40 simulations'; a kind without requests is omitted."""
-        parts = []
-        if self.of_pours:
-            parts.append(f"{self.pours}/{self.of_pours} pours")
-        if self.of_simulations:
-            parts.append(f"{self.simulations}/{self.of_simulations} simulations")
-        return " · ".join(parts)
+        """'3/6 pours · 20/40 simulations', or with limits '3 of ≤6 pours' and at the end '4 pours'; a kind without
+        requests is omitted."""
+        kinds = ((self.pours, self.of_pours, "pour"), (self.simulations, self.of_simulations, "simulation"))
+        return " · ".join(self._count(*kind) for kind in kinds if kind[1])
+
+    def _count(self, made: int, total: int, noun: str) -> str:
+        if not self.limited:
+            return f"{made}/{plural(total, noun)}"
+        return plural(total, noun) if made == total else f"{made} of ≤{plural(total, noun)}"
 
 
 @runtime_checkable

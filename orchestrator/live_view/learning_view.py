@@ -28,6 +28,7 @@ from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import Believed
 from orchestrator.learning.requests import Suggest, Suggested
 from orchestrator.learning.stage_result import StageResult
+from orchestrator.learning.strategy import plural
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
 from orchestrator.records.events import RequestFinished
@@ -141,9 +142,9 @@ class LearningStage:
         if deploying and self._plan.deployment is not None:
             unit = deployment_unit(self._plan.deployment)
         subject = self._names.get(scene or "", scene or "") if deploying else "θ"
-        known = f"{len(query.data)} observations"
+        known = plural(len(query.data), "observation")
         if simulations := len(simulated_points(query)):
-            known = f"{len(query.data)} pours and {simulations} simulations"
+            known = f"{plural(len(query.data), 'pour')} and {plural(simulations, 'simulation')}"
         title = f"{subject}: estimates after {known}"
         self._picture(
             f"{PLACE}/{where}/surrogate",

@@ -12,6 +12,7 @@ import rerun as rr
 
 from actors.laboratory_settings import MODE_LABELS
 from orchestrator.learning.campaign_plan import receiver_name
+from orchestrator.learning.strategy import plural
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
 from orchestrator.records.run_record import RunState
@@ -169,7 +170,7 @@ def status_page(progress: ProgressState, trust: str = "") -> str:
             at = "preparing" if pour.progress is None else pour.progress.checkpoint
             lines.append(f"**Pour {pour.request.number}**: {CHECKPOINT_WORDS.get(at, at)}")
         if count := len(run.running):
-            lines.append(f"**{count} simulation{'s' if count > 1 else ''}** under way")
+            lines.append(f"**{plural(count, 'simulation')}** under way")
         if pour is None and not run.running:
             lines.append("The next step is being chosen")
     elif run.reason:
@@ -179,7 +180,7 @@ def status_page(progress: ProgressState, trust: str = "") -> str:
         lines.append(f"**Best into {_plain(receiver_name(plan, scene))}: {best.unit.text(best.loss)}**")
     if trust:
         lines.append(f"Model check: {_plain(trust)}")
-    lines.append(f"{run.finished_pours} pours and {run.simulated} simulations so far")
+    lines.append(f"{plural(run.finished_pours, 'pour')} and {plural(run.simulated, 'simulation')} so far")
     return "\n\n".join(lines) + "\n"
 
 

@@ -24,7 +24,7 @@ from orchestrator.learning.calibration.calibration_scores import DRAWS
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan
 from orchestrator.learning.requests import Failed, Pour, Simulate, Simulated
 from orchestrator.learning.single_action import CONFIRM
-from orchestrator.learning.strategy import Progress
+from orchestrator.learning.strategy import Progress, plural
 from orchestrator.records.events import CampaignOpened, Event, RequestFinished, RequestStarted, StageOpened
 from orchestrator.records.journal_file import Header
 from orchestrator.records.run_record import NOT_REPORTED, RunPour, RunState
@@ -136,7 +136,7 @@ class ProgressState:
         """'214 simulations, 0.9 s each · best so far 1.10 % (pour 4)'."""
         run, pour = self.run, self.run.pour
         each = f", {sum(self._timed) / len(self._timed):.1f} s each" if self._timed else ""
-        parts = [f"{run.simulated} simulation{'s' * (run.simulated != 1)}{each}"]
+        parts = [f"{plural(run.simulated, 'simulation')}{each}"]
         calibrating = self.pour is not None and is_calibration(self.plan, self.pour.request)
         if run.ahead.waiting and (run.ahead.running or calibrating):  # some of them are never requested
             parts.append(f"{run.ahead.waiting} more made ahead")
@@ -161,7 +161,7 @@ class ProgressState:
             total = self.plan.calibration.pour_count if self.plan.calibration is not None else None
         elif self.plan.deployment is not None:
             total = self.plan.deployment.confirm if confirming else self.plan.deployment.pours
-        of = f"/{total}" if total else ""
+        of = f"/{total}" if total and text.number <= total else ""  # refused pours have numbers, too
         line = f"{'confirming pour' if confirming else 'pour'} {text.number}{of} into {text.receiver}  {text.action}"
         if text.predicted:
             line += f"  predicted {text.predicted}"

@@ -21,6 +21,7 @@ from orchestrator.learning.deployment.model_monitoring import DOUBT, Believed
 from orchestrator.learning.deployment.real_pours import PredictionCheck
 from orchestrator.learning.dispense import Dispensed
 from orchestrator.learning.stage_result import entered_by_hand, weighed_masses
+from orchestrator.learning.strategy import plural
 from orchestrator.records.run_record import RunState
 from orchestrator.records.states import State
 from orchestrator.reports import figure_style as style
@@ -500,16 +501,19 @@ def what_was_asked(plan: CampaignPlan, record: RunState) -> dict[str, str]:
         rows.append(("poured from", _listed(scene.pourer.name for scene in scenes)))
     if doses := [pour.request.dose for pour in record.pours if pour.request.dose is not None]:
         amounts = ", ".join(f"{1e3 * dose.amount:g} g" for dose in doses)
-        cups = len({dose.position for dose in doses})
-        rows.append(("wanted", amounts if mixtures is None else f"{cups} mixtures, {len(doses)} doses"))
+        counts = f"{plural(len({dose.position for dose in doses}), 'mixture')}, {plural(len(doses), 'dose')}"
+        rows.append(("wanted", amounts if mixtures is None else counts))
         return dict(rows)
     if plan.calibration is not None:
         calibration = plan.calibration
         pours = f"{calibration.pour_count} pours, {calibration.holdout} of them kept for testing"
         if calibration.records is not None:
-            pours = f"{len(calibration.records.pours)} weighed pours of {calibration.records.path.name}"
+            pours = f"{plural(len(calibration.records.pours), 'weighed pour')} of {calibration.records.path.name}"
+        simulations = plural(calibration.simulations, "simulation")
+        if getattr(calibration.settings, "simulations", None) == "auto":
+            simulations = f"at most {simulations}"
         rows += [
-            ("calibration", f"{calibration.strategy} on {pours}; {calibration.simulations} simulations"),
+            ("calibration", f"{calibration.strategy} on {pours}; {simulations}"),
             ("calibration: into", calibration.scene.receiver.name),
             ("calibration: actions", _ranges(calibration.actions.axes)),
             ("calibration: searched θ", _ranges(calibration.parameters.axes)),
@@ -528,7 +532,7 @@ def what_was_asked(plan: CampaignPlan, record: RunState) -> dict[str, str]:
             rows.append(("pouring: afterwards", f"the recommended action is poured {two.confirm} more times"))
         if two.data is not None:
             count = sum(len(pours) for pours in two.data.pours.values())
-            rows.append(("pouring: known before", f"{count} pours of {two.data.path.name}"))
+            rows.append(("pouring: known before", f"{plural(count, 'pour')} of {two.data.path.name}"))
     return {name: value for name, value in rows if value}
 
 
@@ -714,7 +718,7 @@ def _pour_table(stage: str, pours: Sequence[PourSummary]) -> ResultTable:
     header += ["spilled / poured [%]", "expected", "measured", "remark"]
     legend = "" if pours[0].calibration else f"; expected and measured: {pours[0].loss}"
     legend += "; the best is bold" if any(pour.best for pour in pours) else ""
-    caption = f"{stage}: {len(pours)} pours into {pours[0].receiver}{legend}"
+    caption = f"{stage}: {plural(len(pours), 'pour')} into {pours[0].receiver}{legend}"
     return ResultTable(caption, header, rows, frozenset(range(len(header) - 1))).filled()
 
 

@@ -87,6 +87,7 @@ def read_study(path: Path) -> StudyPlan:
 
 
 def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...]) -> None:
+    from orchestrator.learning.strategy import plural
     from orchestrator.study.study_folder import is_finished
     from orchestrator.study.study_plan import estimated_seconds
 
@@ -101,10 +102,12 @@ def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...]) -> None:
         todo = [cell for cell in members if cell.id in missing]
         text = f"{len(members) - len(todo)} of {len(members)} finished"
         if todo:
-            text += f", left: {sum(c.simulations for c in todo)} simulations, {sum(c.pours for c in todo)} pours"
+            text += f", left: {plural(sum(c.simulations for c in todo), 'simulation')}, "
+            text += plural(sum(c.pours for c in todo), "pour")
         print(f"{name:34} {text}")
     print(
-        f"{len(cells)} cells, {len(left)} left: {simulations} simulations and {pours} pours, "
+        f"{plural(len(cells), 'cell')}, {len(left)} left: {plural(simulations, 'simulation')} and "
+        f"{plural(pours, 'pour')}, "
         f"some {hours:.2g} CPU hours at least. Simulations that score calibrations, and those that D3 adds while none "
         "is good, are not counted: the study may take two to three times as long. Nothing was started."
     )

@@ -253,7 +253,8 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
     def progress(self) -> Progress:
         """As in the base class; no further simulations after the end."""
         answered = self._trials.answered
-        return Progress(self._spent + answered, self._spent + (self._budget if self._ended is None else answered))
+        total = self._spent + (self._budget if self._ended is None else answered)
+        return Progress(self._spent + answered, total, limited=True)
 
     def result(self) -> Calibrated:
         """As in the base class, with the reason of the end and the seeds of the training pours."""

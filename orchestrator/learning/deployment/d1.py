@@ -19,7 +19,7 @@ from orchestrator.learning.deployment.deployment_ledger import SearchSettings
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.disturbances import Disturbances, RiskSettings
 from orchestrator.learning.requests import Outcome, Request, Simulate, Simulated
-from orchestrator.learning.strategy import Progress, Strategy, is_sound
+from orchestrator.learning.strategy import Progress, Strategy, is_sound, plural
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.prediction_band import SampleStatistics
@@ -65,7 +65,8 @@ class D1Settings(SearchSettings):
     @property
     def spending(self) -> str:
         """The budget per receiver, as text."""
-        return f"{self.rounds} iterations of {self.simulations_per_iteration} simulations, one pour"
+        simulations = plural(self.simulations_per_iteration, "simulation")
+        return f"{plural(self.rounds, 'iteration')} of {simulations}, one pour"
 
     def check(self, premises: Premises, complaints: Problems) -> None:
         """Check that risk is combined with a loss, and that it names at least one error."""

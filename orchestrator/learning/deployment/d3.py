@@ -17,7 +17,7 @@ from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import RiskLimitSettings, Rules, StopSettings
 from orchestrator.learning.deployment.pour_choice import PourChoice
 from orchestrator.learning.requests import Decision
-from orchestrator.learning.strategy import Progress, Strategy
+from orchestrator.learning.strategy import Progress, Strategy, plural
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import Scene
 from sim_engine.settings.model import Problems, SimulationCount
@@ -74,7 +74,8 @@ class D3Settings(SearchSettings):
         """The budget per receiver, as text."""
         most = f" (up to {MOST_PRIOR * self.prior_simulations} while none is good)" if self.adaptive else ""
         between = self.simulations_per_pour
-        return f"{self.prior_simulations} simulations{most}, then {self.pours} pours with {between} beside each"
+        pours = plural(self.pours or 0, "pour")
+        return f"{plural(self.prior_simulations, 'simulation')}{most}, then {pours} with {between} beside each"
 
     def check(self, premises: Premises, complaints: Problems) -> None:
         """Check that each key belongs to the selected model."""
@@ -221,9 +222,10 @@ class Hybrid(Deployment[D3Settings]):
         return self._choice.result(self._report)
 
     def progress(self) -> Progress:
-        """Simulations and pours done, and their totals."""
+        """Simulations and pours done, and their limits; a refused pour is repeated with further simulations."""
         simulations = self._before + self._plan.pours * self._settings.simulations_beside
         done = self._trials.answered - self._ledger.unspent
         ended = self._choice.ended is not None  # no further ones will be made
         pours = self._ledger.counted if ended else self._plan.pours
-        return Progress(done, done if ended else simulations, min(self._ledger.counted, pours), pours)
+        counted = min(self._ledger.counted, pours)
+        return Progress(done, done if ended else simulations, counted, pours, limited=True)

@@ -112,6 +112,27 @@ def test_the_order_in_which_simulations_return_changes_no_request(
     assert replay(make(name, seed), first) == first.asked
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize("name", ["C3", *DEPLOYMENTS])
+def test_no_more_requests_are_counted_than_in_total_and_a_limit_is_no_total(name: str, share: float) -> None:
+    strategy, counts = make(name, 3), []
+
+    class Counting(StrategyHarness):
+        def _next(self, waiting: list[Request]) -> Request:
+            counts.append(strategy.progress())
+            return super()._next(waiting)
+
+    refused = failures(share, 3)
+    Counting(spill(name), slots=2, answer=refused).run(strategy)
+    counts.append(strategy.progress())
+    assert all(one.simulations <= one.of_simulations and one.pours <= one.of_pours for one in counts)
+    if "D3" in name:
+        assert all(one.limited for one in counts)
+        assert str(counts[0]) == "0 of ≤3 pours · 0 of ≤12 simulations"
+    elif share == 0.0:
+        assert len({one.total for one in counts}) == 1
+
+
 NAN = math.nan
 
 

@@ -159,6 +159,20 @@ def test_pours_and_simulations_are_told_apart_with_the_time_left_in_all() -> Non
     assert "6/6 pours · 14/40 simulations" in written(screen)
 
 
+@pytest.mark.parametrize(
+    ("progress", "text"),
+    [
+        (Progress(194, 400, limited=True), "194 of ≤400 simulations"),
+        (Progress(194, 194, limited=True), "194 simulations"),
+        (Progress(44, 40, 1, 1), "1/1 pour · 44/44 simulations"),
+        (Progress(1, 16, 0, 6, limited=True) + Progress(0, 24), "0 of ≤6 pours · 1 of ≤40 simulations"),
+        (Progress(), ""),
+    ],
+)
+def test_counts_never_exceed_their_total_and_limits_are_not_shown_as_totals(progress: Progress, text: str) -> None:
+    assert str(progress) == text
+
+
 def test_best_so_far_is_kept_per_receiver_and_ignores_calibration_pours() -> None:
     plan = campaign()
     tally = ProgressState(plan)
