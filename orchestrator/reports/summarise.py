@@ -98,13 +98,13 @@ def summarise(
     """
     record, totals, files = record or RunState(Header(plan.name, {})), totals or Totals(), files or RunFiles()
     learning = _learning(plan, results)
-    calibrated, receivers = learning.calibrated_theta is not None, _receivers(plan, results, best_not_covered or {})
+    receivers = _receivers(plan, results, best_not_covered or {})
     advised = wording.advice(plan, receivers)
     outcome = _outcome(
         plan,
         record,
         advice=advised,
-        without_advice=() if advised else tuple(wording.without_advice(plan, record, calibrated=calibrated)),
+        without_advice=() if advised else tuple(wording.without_advice(plan, record, learning)),
         open_questions=(*_of_memory(results), *wording.open_questions(plan, record, learning, files.dropped_events)),
         loss=None if plan.deployment is None else plan.deployment.loss_name,
         loss_label="" if plan.deployment is None else deployment_unit(plan.deployment).label,

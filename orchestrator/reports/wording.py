@@ -12,8 +12,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from actors.dosing.dose_series import LOST
+from orchestrator.learning.calibration.calibration_scores import Scores
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory, MemoryFound
 from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
+from orchestrator.learning.calibration.pour_residuals import PourResidual
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan
 from orchestrator.learning.deployment.deployment_ledger import EQUAL_LOSS
 from orchestrator.learning.deployment.deployment_result import Recommended, RiskFound
@@ -42,6 +44,7 @@ from orchestrator.reports.run_summary import (
     RunSummary,
 )
 from orchestrator.reports.stage_views import SPLITS
+from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourMeasurement
 from sim_engine.prediction_band import PredictionInterval
@@ -249,6 +252,8 @@ def open_questions(plan: CampaignPlan, record: RunState, learning: RunLearning, 
         )
     if learning.calibrated_theta is not None:
         lines += _about_theta(learning)
+        if plan.deployment is not None and (error := unfitted_error(learning)):
+            lines.append(error)
     elif plan.calibration is None:
         lines.append("The simulator was not calibrated in this run: its parameters are those of the campaign.")
     liquids = {scene.liquid.name for scene in plan.deployment.scenes} if plan.deployment is not None else set()
@@ -273,19 +278,27 @@ def _about_theta(learning: RunLearning) -> list[str]:
     elif posterior.open:
         names = ", ".join(name.replace("_", " ") for name in posterior.open)
         lines.append(f"The pours do not determine {names}: nearly the whole searched range fits them as well as θ*.")
-    unseen = [
-        f"{DISCREPANCY.text(mean)} on {SPLITS[split]}"
-        for split, row in learning.discrepancy.items()
-        if split != "train" and (mean := row.get(used)) is not None
-    ]
-    if unseen:
-        lines.append(
-            f"On pours that calibration did not see, the simulator's spillage was off by {' and '.join(unseen)} in the "
-            "mean."
-        )
-    elif learning.discrepancy:
+    if learning.discrepancy and not unfitted_error(learning):
         lines.append("The simulator was not scored on pours that calibration did not see.")
     return lines
+
+
+def unfitted_error(learning: RunLearning) -> str:
+    """The error on pours that were not fitted, with that of a regression without a simulator; '' if none was scored."""
+    gain = learning.calibration_gain
+    used = "calibrated" if gain is None else gain.recommended
+    parts = []
+    for split, row in learning.discrepancy.items():
+        if split == "train" or (mean := row.get(used)) is None:
+            continue
+        regression = row.get("regression")
+        rival = "a regression can't predict it" if split == "transfer" else ""
+        if regression is not None:
+            rival = f"a regression of the training pours, without a simulator: {DISCREPANCY.text(regression)}"
+        parts.append(f"{DISCREPANCY.text(mean)} on {SPLITS[split]}{rival and f' ({rival})'}")
+    if not parts:
+        return ""
+    return f"On pours that were not fitted, the simulated spillage is off by {' and '.join(parts)} in the mean."
 
 
 def memory_sentences(memory: CampaignMemory | None, verdict: MemoryFound | None) -> list[str]:
@@ -359,12 +372,8 @@ def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
     return [*lines, *posterior.directions]
 
 
-def without_advice(plan: CampaignPlan, record: RunState, *, calibrated: bool) -> list[str]:
-    """The outcome of a run that recommends no action.
-
-    Args:
-        calibrated: whether θ* was found.
-    """
+def without_advice(plan: CampaignPlan, record: RunState, learning: RunLearning) -> list[str]:
+    """The outcome of a run that recommends no action."""
     if plan.deployment is not None and any(name.startswith("deployment") for name in record.stages):
         lines = ["No action is recommended yet: the result of a deployment is written when its stage ends."]
         losses = {loss: pour for pour in record.weighed if (loss := minimised_loss(plan, pour)) is not None}
@@ -380,10 +389,12 @@ def without_advice(plan: CampaignPlan, record: RunState, *, calibrated: bool) ->
             )
             lines.append(f"{of} is {unit.text(min(known))}, with {best}.")
         return lines
-    if calibrated:
+    if learning.calibrated_theta is not None:
+        error = unfitted_error(learning)
         return [
+            *([error] if error else []),
             "This run calibrated the simulator; it recommends no action. The parameters to use are in theta.json, "
-            "which 'decant plan CAMPAIGN --parameters' reads."
+            "which 'decant plan CAMPAIGN --parameters' reads.",
         ]
     return ["This run recommends no action."]
 
@@ -672,14 +683,43 @@ def receiver_table(outcome: RunOutcome) -> ResultTable:
 
 
 def pour_tables(summary: RunSummary) -> list[ResultTable]:
-    """Every requested pour, one table for each stage."""
+    """Every requested pour, one table for each stage; and every pour that a calibration was scored on."""
     stages = dict.fromkeys(pour.stage for pour in summary.outcome.pours_made)
-    return [
+    scores = next((result for result in summary.results.values() if isinstance(result, Scores)), None)
+    scored = [_residual_table(scores.pours)] if scores is not None and scores.pours else []
+    return scored + [
         _dose_table(stage, doses)
         if isinstance(doses := summary.results.get(stage), Dispensed)
         else _pour_table(stage, [pour for pour in summary.outcome.pours_made if pour.stage == stage])
         for stage in stages
     ]
+
+
+def _residual_table(pours: Sequence[PourResidual]) -> ResultTable:
+    names = {name: None for pour in pours for name in pour.action}
+    varied = [name for name in names if len({pour.action.get(name) for pour in pours}) > 1]
+    remarks = list(dict.fromkeys(name for pour in pours for name in pour.remarks))
+    rows = []
+    for pour in pours:
+        actions = ["—" if (value := pour.action.get(name)) is None else f"{value:.4g}" for name in varied]
+        shares = [pour.measured, pour.simulated, pour.residual]
+        cells = [
+            str(pour.number),
+            "—" if pour.line is None else str(pour.line),
+            SPLITS[pour.split].removesuffix(" pours"),
+            *actions,
+        ]
+        cells += ["—" if share is None else f"{100 * share:.2f}" for share in shares]
+        bounded = pour.low is not None and pour.high is not None
+        cells.append(f"{100 * (pour.low or 0.0):.2f} … {100 * (pour.high or 0.0):.2f}" if bounded else "—")
+        cells += ["no" if pour.fits is False else "—", *(pour.remarks.get(name) or "—" for name in remarks)]
+        rows.append(ResultRow(cells, "bad" if pour.fits is False else ""))
+    labels = [style.label(next(name for name in ACTION_DIMENSIONS if column.startswith(name))) for column in varied]
+    header = ["pour", "line", "used as", *labels]
+    header += ["weighed", "simulated", "difference", "expected", "fits", *remarks]
+    caption = f"{len(pours)} weighed pours with their simulation by θ*; spilled / poured [%]"
+    numbers = frozenset({0, 1, *range(3, len(varied) + 7)})
+    return ResultTable(caption, header, rows, numbers).filled()
 
 
 def _dose_table(stage: str, dispensed: Dispensed) -> ResultTable:

@@ -34,6 +34,7 @@ from orchestrator.reports.html_report import run_page
 from orchestrator.reports.publishing import Published, publish
 from orchestrator.reports.run_summary import RunFiles, summary_json
 from orchestrator.reports.summarise import summarise
+from orchestrator.reports.wording import pour_tables
 from orchestrator.runs.request_executor import FILM_RATE
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.run_folder import create_run
@@ -42,7 +43,7 @@ from orchestrator.runs.stages import stages_of
 from sim_engine.outcome import SimulatedPour
 from sim_engine.scene import PourTask
 from tests.support import example_run
-from tests.support.example_results import shown
+from tests.support.example_results import changed, shown
 from tests.support.small_campaign import CAMPAIGN, write_campaign
 from tests.support.toy_campaign import ToyBench, ToyLaboratory, ToySimulators
 
@@ -139,6 +140,51 @@ def test_it_says_what_to_do_what_to_expect_and_what_nobody_knows(made: Made) -> 
     assert "The bench was VIRTUAL: no robot moved and no liquid was weighed." in said
     assert "θ* with its region" in said
     assert "5 begun, 5 weighed" in said
+
+
+TABLE = """angular_velocity_deg_s,max_angle_deg,poured_g,spilled_g,retained_g,split,operator
+60,80,98,2.1,2,train,Ada
+75,95,98,3.0,2,train,Ada
+90,110,98,4.2,2,train,Ada
+105,85,98,5.1,2,train,Bo
+120,100,98,45.0,2,train,Bo
+150,90,98,7.1,2,train,Bo
+165,105,98,8.3,2,train,Bo
+80,100,98,3.6,2,test,Ada
+135,95,98,6.4,2,test,Bo
+"""
+
+
+def test_a_calibration_from_a_table_lists_its_pours_and_begins_with_the_error_on_those_that_were_not_fitted(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "pours.csv").write_text(TABLE, encoding="utf-8")
+    text = CAMPAIGN.replace("pours: {count: 3, holdout: 1}", "pours: {from: pours.csv}")
+    text = "\n".join(text.split("deployment:")[0].splitlines()) + "\noutputs: {directory: runs}\n"
+    plan = load_campaign(write_campaign(tmp_path, text))
+    result = asyncio.run(run_campaign(plan, laboratory(), create_run(plan)))
+    made = Made(plan, result, publish(plan, result))
+    said = texts(made.page)
+    scores = made.published.summary.results["evaluation"]
+    scored, gain = made.published.summary.learning.discrepancy["test"], scores.gain
+    error, regression = 100 * scored[gain.recommended], 100 * scored["regression"]
+    assert said.split(" Summary ")[1].startswith(
+        f"On pours that were not fitted, the simulated spillage is off by {error:.2f} % on test pours (a regression of "
+        f"the training pours, without a simulator: {regression:.2f} %) in the mean."
+    )
+    assert said.count(" is off by ") == 1
+    assert "No pour" not in said
+    assert "used as angular velocity [deg/s] max angle [deg] weighed simulated" in said
+    table = said[said.index("9 weighed pours with their simulation by θ*") :]
+    swapped = scores.pours[4]
+    assert f"5 6 training 120 100 45.92 {100 * swapped.simulated:.2f} {100 * swapped.residual:.2f} " in table
+    assert re.search(r"6 7 training 150 90 7\.24 .* Bo 7 8 training", table)
+
+    unfit = [changed(pour, fits=pour.number != 5) for pour in scores.pours]
+    summary = made.published.summary.model_copy(update={"results": {"evaluation": changed(scores, pours=unfit)}})
+    (listed,) = pour_tables(summary)
+    assert [row.cells[0] for row in listed.rows if row.look == "bad"] == ["5"]
+    assert listed.rows[4].cells[-2:] == ["no", "Bo"]
 
 
 def test_ranges_of_theta_have_the_unit_of_their_value(made: Made) -> None:
