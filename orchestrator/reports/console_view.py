@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from rich import box
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
@@ -16,6 +16,71 @@ from orchestrator.reports.wording import ResultTable, receiver_table, score_tabl
 
 PLAIN_WIDTH, LONGEST_LINE = 110, 1_000
 """Minimum and maximum number of columns of the table if stderr is not a terminal."""
+
+
+class TextTable:
+    """A table that cuts no word: on a screen that is too narrow for its columns, each row is a list of heads and cells.
+
+    Args:
+        heads: of the columns.
+        rows: cells, one for each head.
+        numbers: places of columns that are right-aligned.
+        title: line above the table.
+    """
+
+    def __init__(
+        self, heads: Sequence[str], rows: Sequence[Sequence[str]], numbers: Collection[int] = (), title: str = ""
+    ) -> None:
+        self._heads, self._rows, self._numbers, self._title = heads, rows, numbers, title
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        return Measurement.get(console, options, self._table(None))
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        wide = options.update(max_width=LONGEST_LINE)
+        columns = [
+            [Measurement.get(console, wide, Text(text)) for text in (head, *cells) if text] or [Measurement(1, 1)]
+            for head, *cells in zip(self._heads, *self._rows, strict=True)
+        ]
+        widths = [max(text.minimum for text in column) for column in columns]
+        natural = [max(text.maximum for text in column) for column in columns]
+        frame = Measurement.get(console, wide, self._table(None)).maximum - sum(natural)
+        free = options.max_width - frame - sum(widths)
+        if free < 0:
+            yield self._list(options.max_width)
+            return
+        places = sorted(range(len(widths)), key=lambda place: natural[place] - widths[place])
+        for others, place in zip(range(len(places), 0, -1), places, strict=True):  # an equal share, if it needs one
+            share = min(natural[place] - widths[place], free // others)
+            widths[place] += share
+            free -= share
+        yield self._table(widths)
+
+    def _table(self, widths: Sequence[int] | None) -> Table:
+        title = Text(self._title, style="bold") if self._title else None
+        padding = (0, 1, 0, 0)  # two columns between cells: one of padding, one of the box
+        table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=padding)
+        for place, head in enumerate(self._heads):
+            width = None if widths is None else widths[place]
+            table.add_column(Text(head), justify="right" if place in self._numbers else "left", width=width)
+        for row in self._rows:
+            table.add_row(*map(Text, row))
+        return table
+
+    def _list(self, width: int) -> RenderableType:
+        """'  head cell · head cell' in lines of at most `width`, below the first cell of each row."""
+        lines: list[Text] = [Text(self._title, style="bold")] if self._title else []
+        for first, *others in self._rows:
+            lines.append(Text(f"{self._heads[0]} {first}".strip(), style="bold"))
+            line = ""
+            for head, cell in zip(self._heads[1:], others, strict=True):
+                pair = f"{head} {cell}".strip() if cell else ""
+                if line and len(line) + len(pair) + 5 > width:
+                    lines.append(Text(f"  {line}"))
+                    line = ""
+                line = " · ".join(filter(None, (line, pair)))
+            lines.append(Text(f"  {line}"))
+        return Group(*lines)
 
 
 def summary_table(summary: RunSummary) -> RenderableType:
@@ -59,22 +124,14 @@ def print_table(rows: Sequence[Mapping[str, str]], *, right: Sequence[str] = (),
         rows: head → cell, the same heads in each.
         right: heads of columns with numbers, which are right-aligned.
     """
-    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
-    shown = [head for head in rows[0] if any(row[head] for row in rows)] if rows else []
-    for head in shown:
-        table.add_column(Text(head), justify="right" if head in right else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*(Text(row[head]) for head in shown))
-    _print(table)
+    heads = [head for head in rows[0] if any(row[head] for row in rows)] if rows else []
+    cells = [[row[head] for head in heads] for row in rows]
+    numbers = {place for place, head in enumerate(heads) if head in right}
+    _print(TextTable(heads, cells, numbers, title or ""))
 
 
 def _table(content: ResultTable) -> RenderableType:
-    table = Table(title=Text(content.caption), title_justify="left", box=box.SIMPLE_HEAD)
-    for place, head in enumerate(content.header):
-        table.add_column(Text(head), justify="right" if place in content.numbers else "left")
-    for row in content.rows:
-        table.add_row(*map(Text, row.cells))
-    return table
+    return TextTable(content.header, [row.cells for row in content.rows], content.numbers, content.caption)
 
 
 def _print(table: RenderableType, *, to_stderr: bool = False) -> None:
