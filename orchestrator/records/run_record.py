@@ -102,6 +102,11 @@ class RunPour:
         """Why it failed."""
         return self.outcome.reason if isinstance(self.outcome, Failed) else ""
 
+    @property
+    def refused(self) -> bool:
+        """Whether it was refused before anything moved."""
+        return isinstance(self.outcome, Failed) and self.outcome.kind == "invalid_action"
+
     def row(self) -> Row:
         """The one row of a pour in numbers: action in display units, prediction, masses [g] and spillage r.
 

@@ -161,7 +161,9 @@ class ProgressState:
             total = self.plan.calibration.pour_count if self.plan.calibration is not None else None
         elif self.plan.deployment is not None:
             total = self.plan.deployment.confirm if confirming else self.plan.deployment.pours
-        of = f"/{total}" if total and text.number <= total else ""  # refused pours have numbers, too
+        begun = text.number - sum(p.stage == pour.stage and p.id != pour.id and p.refused for p in self.run.pours)
+        of = f"/{total}" if begun == text.number else f" ({begun} of {total})"
+        of = of if total and begun <= total else ""
         line = f"{'confirming pour' if confirming else 'pour'} {text.number}{of} into {text.receiver}  {text.action}"
         if text.predicted:
             line += f"  predicted {text.predicted}"

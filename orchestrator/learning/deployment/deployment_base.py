@@ -205,7 +205,9 @@ class Deployment(ABC, Generic[S]):
         trial = self._ledger.begin(point, prediction)
         action = self._scene.action(trial.values)
         self._queued_pour = Pour(self._scene.name, action, trial.number, self._seeds.next(), prediction)
-        text = f"pour {trial.number}/{self._plan.pours}  {described(trial.values)}"
+        begun, of = self._ledger.counted + 1, self._plan.pours
+        name = f"pour {begun}/{of}" if trial.number == begun else f"pour {trial.number} ({begun} of {of})"
+        text = f"{name}  {described(trial.values)}"
         self.decisions.append(Decision(text) if prediction is None else expecting(text, prediction))
 
     def _pour_first(self, suggestion: Suggestion) -> None:

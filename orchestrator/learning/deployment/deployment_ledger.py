@@ -96,7 +96,8 @@ class DeploymentLedger:
     def begin(self, point: Point, predicted: Prediction | None) -> PourTrial:
         """Enter a pour that is about to be requested."""
         noise = 0.0 if predicted is None or predicted.scatter is None else predicted.scatter
-        self.pours.append(PourTrial(self.counted + 1, point, self.plan.actions.decode(point), predicted, noise))
+        number = self._former_counted + len(self.pours) + 1
+        self.pours.append(PourTrial(number, point, self.plan.actions.decode(point), predicted, noise))
         return self.pours[-1]
 
     def take(self, outcome: Outcome) -> None:

@@ -46,7 +46,7 @@ class PourRow(WeighedMasses):
     """A real pour of a deployment: its action, its prediction and its outcome."""
 
     number: int
-    """Number from 1; a refused pour does not count, and the next one has the same number. 0: added by hand."""
+    """Number from 1 among the requested pours, refused ones included. 0: added by hand."""
 
     status: Status
     """'refused': an invalid action, nothing was poured. 'failed': an error occurred during the pour or the weighing.

@@ -221,6 +221,17 @@ def test_failed_pours_and_simulations_are_shown_as_such() -> None:
     assert "failed: the gripper slipped" in (tally.pour_line() or "")
 
 
+def test_a_refused_pour_keeps_its_number_and_the_next_one_says_how_many_were_begun() -> None:
+    plan = campaign()
+    tally, pours = ProgressState(plan), [e for e in events(plan) if isinstance(getattr(e, "request", None), Pour)]
+    for event in pours:
+        first = isinstance(event, RequestFinished) and event.request.number == 1
+        tally(replace(event, outcome=Failed("invalid_action", "joint 6 would turn at 150 deg/s")) if first else event)
+        if isinstance(event, RequestStarted):
+            lines = {1: "pour 1/3 into", 2: "pour 2 (1 of 3) into", 3: "pour 3 (2 of 3) into"}
+            assert (tally.pour_line() or "").startswith(lines[event.request.number])
+
+
 def test_display_can_be_left_after_a_failure_and_says_how_the_run_ended() -> None:
     plan, terminal = campaign(), console(terminal=True)
     display = ProgressDisplay(plan, console=terminal)

@@ -98,6 +98,11 @@ def test_a_plan_that_the_arm_refuses_is_replaced_by_the_next_best_one() -> None:
     played = StrategyHarness(narrow_cup, answer=refused_twice).run(strategy)
     assert [row.status for row in strategy.result().pours] == ["refused", "refused", "weighed"]
     assert len({pour.action for pour in played.pours}) == 3
+    assert [row.number for row in strategy.result().pours] == [pour.number for pour in played.pours] == [1, 2, 3]
+    assert [d.text.split("  ")[0] for d in strategy.decisions if d.text.startswith("pour ")] == [
+        *("pour 1/1", "pour 2 (1 of 1)", "pour 3 (1 of 1)"),
+        *(d.text for d in strategy.decisions if d.text.startswith("pour 3: loss")),
+    ]
     assert strategy.best_values == {
         name: pytest.approx(value) for name, value in strategy.result().pours[-1].action_si.items()
     }
