@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -115,7 +116,8 @@ def _maps(picture: SurrogatePicture) -> Figure:
     for place, (name, grid) in enumerate(shown):
         _map_panel(figure, axes[0, place], picture, name, grid)
     marked = {name: h for h, name in zip(*axes[0, 0].get_legend_handles_labels(), strict=True)}
-    notes, size = "\n".join(_notes(picture)), 8.5
+    wide = round(15 * figure.get_figwidth())  # letters of this size
+    notes, size = "\n".join(textwrap.fill(note, wide) for note in _notes(picture)), 8.5
     if marked and alone:  # the notes are in the legend: both below the map would overlap
         below = {"title": notes or None, "title_fontsize": size, "alignment": "left"}
         figure.legend(

@@ -300,6 +300,12 @@ def test_a_best_action_at_an_end_of_the_box_is_said_to_be_there() -> None:
     assert "end" not in said[1]
 
 
+def test_a_note_below_a_single_map_is_as_wide_as_the_figure() -> None:
+    grid = np.zeros((5, 5))
+    figure = draw_surrogate(at_the_edges(mean=grid, numbers=[1, 2, 3, 4], best_name="recommended action of this bench"))
+    assert strays(figure) == []
+
+
 def test_a_surrogate_that_expects_the_impossible_does_not_stretch_the_colours() -> None:
     grid = np.full((5, 5), 20.0)
     grid[0, 0] = 500.0
