@@ -100,9 +100,16 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
     return work
 
 
+WHERE_RUNS_GO = (
+    "Journal, figures and recording are written to a folder of the run, in the campaign's `outputs.directory`, or in "
+    "'runs' in the working directory if the campaign names none."
+)
+
 run = _task_command(
     "run",
-    """Run a campaign: calibrate, then learn to pour. Journal, figures and recording are written to runs/ID/.
+    f"""Run a campaign: calibrate, then learn to pour.
+
+{WHERE_RUNS_GO}
 
 Ctrl-C pauses the run: a pour that has started is finished and weighed first. `--resume` continues it.
 """,
@@ -110,9 +117,10 @@ Ctrl-C pauses the run: a pour that has started is finished and weighed first. `-
 
 calibrate = _task_command(
     "calibrate",
-    """Only calibrate: find the θ whose simulated spillage matches the weighed pours (C1 to C4), scored on other pours.
+    f"""Only calibrate: find the θ whose simulated spillage matches the weighed pours (C1 to C4), scored on other pours.
 
-The recommended θ is written to runs/ID/theta.json in SI units (cohesion in N/m, xsph_rate in 1/s), for `--parameters`.
+{WHERE_RUNS_GO} Its theta.json has the recommended θ in SI units (cohesion in N/m, xsph_rate in 1/s), for
+`--parameters`.
 """,
 )
 
@@ -172,7 +180,8 @@ def plan(
     """Plan a pour in simulation (D1), for the campaign's receivers or for a new one.
 
     By default, fifteen actions are simulated, in parallel on all cores. The planned action is then simulated with
-    further seeds, which give its prediction and prediction interval. Nothing is poured.
+    further seeds, which give its prediction and prediction interval. Nothing is poured. The folder of the planning is
+    made where those of the campaign's runs are: in its `outputs.directory`, or in 'runs' in the working directory.
 
     Actions are shown in deg, deg/s, mm and s.
     """

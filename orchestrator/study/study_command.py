@@ -38,8 +38,8 @@ def run_study(
 ) -> None:
     """Compare C1 to C4 and D1 to D3 with repetitions, on virtual benches that differ more or less from the simulator.
 
-    Figures (PNG, SVG, CSV), tables and a page are written to runs/study-NAME/report/. Run the same command again to
-    continue a study that was stopped or killed.
+    Figures (PNG, SVG, CSV), tables and a page are written to study-NAME/report/ in the study's `directory`. Run the
+    same command again to continue a study that was stopped or killed.
     """
     from orchestrator.study.study_folder import check_settings, opened
     from orchestrator.study.study_plan import cells_of
@@ -107,9 +107,8 @@ def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...]) -> None:
         print(f"{name:34} {text}")
     print(
         f"{plural(len(cells), 'cell')}, {len(left)} left: {plural(simulations, 'simulation')} and "
-        f"{plural(pours, 'pour')}, "
-        f"some {hours:.2g} CPU hours at least. Simulations that score calibrations, and those that D3 adds while none "
-        "is good, are not counted: the study may take two to three times as long. Nothing was started."
+        f"{plural(pours, 'pour')}, some {hours:.2g} CPU hours (good to a factor of two; D3 simulates more while no "
+        "simulation is good). Nothing was started."
     )
 
 

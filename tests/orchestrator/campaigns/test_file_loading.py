@@ -24,8 +24,10 @@ from orchestrator.learning.deployment.d2 import D2Settings
 from orchestrator.learning.deployment.d3 import D3Settings
 from orchestrator.records.run_registry import state_directory
 from orchestrator.runs.run_folder import create_run
+from orchestrator.runs.run_tasks import plan_task, run_task
 from orchestrator.study.study_file import load_study
 from sim_engine.action import DEG
+from tests.support import small_campaign
 from tests.support.campaign_files import CAMPAIGN, report, write, write_good
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -433,3 +435,17 @@ def test_symmetry_can_not_be_forced(tmp_path: Path) -> None:
     assert "campaign.yaml:8:13: simulator.symmetry: 'on' is not known here; should be 'auto' or 'off'" in report(
         write(write_good(tmp_path), "campaign.yaml", bad)
     )
+
+
+def test_a_run_and_a_planning_go_where_the_campaign_says_else_into_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "campaign").mkdir()
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    named = load_campaign(small_campaign.write_campaign(tmp_path / "campaign"))
+    text = small_campaign.CAMPAIGN.replace("outputs: {directory: runs}\n", "")
+    unnamed = load_campaign(small_campaign.write_campaign(tmp_path / "campaign", text))
+    for plan, folder in ((named, "campaign"), (unnamed, "work")):
+        for request in (run_task(plan), plan_task(plan)):
+            assert request.campaign.outputs.folder == tmp_path / folder / "runs"
