@@ -102,7 +102,7 @@ def write_scratch(folder: Path) -> str:
     _change(folder / "configs/campaigns/recorded.yaml", _small_recorded)
     for table in (folder / "configs/data").glob("*/*.csv"):
         _shorten(table)
-    for name in ("quick", "paper"):
+    for name in ("quick", "paper", "figure-6"):
         _change(folder / f"configs/studies/{name}.yaml", _small_study)
     plan = load_campaign(folder / "configs/campaigns/quickstart.yaml")
     finished, paused = folder / "runs" / "quickstart-20300131-1", folder / "runs" / "quickstart-20300131-2"

@@ -161,6 +161,12 @@ GRID, FINAL = "grid", "final"
 PARTICLE_SECONDS = 0.0007
 """CPU seconds of a simulation per particle, for a first estimate; later estimates use the measured speed."""
 
+CHANGE_SECONDS = 0.6
+"""CPU seconds of the change to another θ, of which nearly each simulation has its own, and of the optimiser's part."""
+
+CELL_SECONDS = 3.0
+"""CPU seconds of a cell without simulations and pours."""
+
 
 @dataclass(frozen=True)
 class StudyCell:
@@ -259,4 +265,6 @@ def estimated_seconds(study: StudyPlan, cell: StudyCell) -> float:
     if "particles" in axes:
         usual = math.sqrt(axes["particles"].lower * axes["particles"].upper)
     hidden = study.level(cell.level).bench.theta.particles if cell.level else 0
-    return PARTICLE_SECONDS * (cell.simulations * usual + cell.pours * hidden) + 3.0
+    changes = 0 if cell.kind == "uncalibrated" else cell.simulations
+    pouring = PARTICLE_SECONDS * (cell.simulations * usual + cell.pours * hidden)
+    return pouring + CHANGE_SECONDS * changes + CELL_SECONDS

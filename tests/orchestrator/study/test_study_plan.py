@@ -20,7 +20,7 @@ from orchestrator.learning.deployment.d2 import RealOnly
 from orchestrator.learning.deployment.d3 import Hybrid
 from orchestrator.study.study_campaigns import campaign_of
 from orchestrator.study.study_file import load_study
-from orchestrator.study.study_plan import cells_of
+from orchestrator.study.study_plan import cells_of, estimated_seconds
 from sim_engine.vessel.vessel import build_vessel
 from tests.support import plans
 from tests.support.study_files import ROOT, STUDIES, read, small, without, written
@@ -243,3 +243,20 @@ def test_what_is_wrong_with_a_study_is_said_with_its_place(case: str, tmp_path: 
 def test_a_campaign_is_no_study() -> None:
     with pytest.raises(ConfigError, match="describes a campaign, but a study is needed here"):
         load_study(ROOT / "configs" / "campaigns" / "quickstart.yaml")
+
+
+MEASURED = {
+    "calibration.moderate.C4.01": 80.4,
+    "deployment.moderate.D1-15.deployment-cone.01": 37.0,
+    "deployment.moderate.D3.deployment-narrow.01": 75.1,
+    "uncalibrated.moderate.01": 6.9,
+}
+"""CPU seconds of cells of the shipped study of figure 6, one at a time on a core that other programs used too."""
+
+
+def test_the_estimate_of_cpu_time_is_good_to_a_factor_of_two() -> None:
+    study = load_study(ROOT / "configs" / "studies" / "figure-6.yaml")
+    estimated = {cell.id: estimated_seconds(study, cell) for cell in cells_of(study)}
+    for name, seconds in MEASURED.items():
+        assert 0.5 < estimated[name] / seconds < 2.0, name
+    assert 15 * 60 < sum(estimated.values()) < 2 * 15 * 60, "it fits 15 minutes of two cores"

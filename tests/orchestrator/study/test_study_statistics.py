@@ -6,6 +6,7 @@ import csv
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -291,6 +292,30 @@ def test_recommended_actions_are_compared_by_their_own_pours(study: StudyPlan) -
         assert isinstance(one, Estimate)
         assert (one.mean, one.high) == pytest.approx((difference, difference)), "repetitions share their chance"
         assert small[compared][6] == "2 of 2"
+
+
+def test_a_strategy_of_a_package_is_compared_with_d3_and_with_d2(study: StudyPlan) -> None:
+    planned, *others = study.deployments
+    with_plugin = replace(study, deployments=(replace(planned, label="Mine"), *others))
+    found = gather(study, {cell.id: made_up(cell) for cell in cells_of(study)})
+    for of in (found.losses, found.numbers, found.finals):
+        for key in [key for key in of if key.strategy == planned.label]:
+            of[replace(key, strategy="Mine")] = of.pop(key)
+    (effects,) = (table for table in tables(with_plugin, found) if table.name == "table-effects")
+    compared = {(str(row[0]), str(row[1]).endswith("final action")) for row in effects.rows}
+    assert {(f"Mine − {rival}", final) for rival in ("D3", "D2") for final in (False, True)} <= compared
+
+
+def test_the_paper_s_budgets_and_findings_are_beside_ours_with_their_source(study: StudyPlan, tmp_path: Path) -> None:
+    for cell in cells_of(study):
+        run_folder(tmp_path, cell.id).mkdir(parents=True)
+        write_result(tmp_path, cell.id, made_up(cell))
+    page = write_report(study, tmp_path).read_text(encoding="utf-8")
+    beside = {row["of"]: row for row in rows(tmp_path, "table-paper")}
+    assert (beside["C4"]["in the paper"], beside["C4"]["here"]) == ("108 simulations", "6 simulations")
+    assert beside["D1-2"]["in the paper"] == "5, 10 or 15 iterations, one pour"
+    assert (beside["D3"]["repetitions in the paper"], beside["D3"]["repetitions here"]) == ("3", "2")
+    assert "Counterpart of figure 6 of Lopez-Guevara et al., CoRL 2017: D2 spilled least into cup 1" in page
 
 
 def test_the_page_tells_by_how_many_codes_the_cells_were_made(study: StudyPlan) -> None:
