@@ -69,15 +69,16 @@ def campaign_blueprint(
             _whole(f"/learning/{place}", f"{name}: model check", contents=["$origin/trust"]) for place, name in named
         ]
 
-    def maps() -> list[Any]:
+    def maps(under: str = "") -> list[Any]:
         views = []
         for scene, name in receivers.items():
-            views += _surrogate(safe_name(scene), f"{name}: expected loss", sliced=action_slices)
+            views += _surrogate(f"{under}/learning/{safe_name(scene)}", f"{name}: expected loss", sliced=action_slices)
         return views
 
-    def theta() -> list[Any]:
-        picture = _picture("/learning/calibration/theta", "θ* and which θ fit the pours")
-        return [*_surrogate("calibration", "Discrepancy over θ", sliced=theta_slices), picture]
+    def theta(under: str = "") -> list[Any]:
+        place = f"{under}/learning/calibration"
+        picture = _picture(f"{place}/theta", "θ* and which θ fit the pours")
+        return [*_surrogate(place, "Discrepancy over θ", sliced=theta_slices), picture]
 
     def calibrated() -> Any:
         return _loss("calibration", "Calibration pours: spilled / poured [%]")
@@ -107,7 +108,7 @@ def campaign_blueprint(
         rrb.Vertical(
             rrb.Horizontal(_weighed_pour(), _shares()),
             rrb.Tabs(*losses(), calibrated()),
-            rrb.Tabs(*maps(), *theta()),
+            rrb.Tabs(*maps("/outcome"), *theta("/outcome")),  # the last ones, at every position of the time cursor
             row_shares=[4, 4, 5],
         ),
         rrb.Vertical(rrb.Tabs(_outcome(), _status()), _log(), row_shares=[5, 4]),
@@ -235,8 +236,8 @@ def _weighed_pour(under: str = "", name: str = "Pour: spilled [g], weighed and s
 
 
 def _surrogate(place: str, name: str, *, sliced: bool) -> list[Any]:
-    views = [_picture(f"/learning/{place}/surrogate", name)]
-    return [*views, _picture(f"/learning/{place}/slices", f"{name}, two axes at a time")] if sliced else views
+    views = [_picture(f"{place}/surrogate", name)]
+    return [*views, _picture(f"{place}/slices", f"{name}, two axes at a time")] if sliced else views
 
 
 def _loss(place: str, name: str) -> Any:

@@ -30,6 +30,7 @@ from orchestrator.learning.requests import Suggest, Suggested
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.learning.strategy import plural
 from orchestrator.live_view import rerun_shapes as shapes
+from orchestrator.live_view.machine_view import OUTCOME
 from orchestrator.live_view.recording_sink import RecordingSink
 from orchestrator.records.events import RequestFinished
 from orchestrator.records.run_record import RunPour
@@ -84,6 +85,7 @@ class LearningStage:
         self._scene_of_stage: dict[str, str] = {}
         self._drawn: dict[str, float] = {}
         self._waiting: dict[str, Callable[[], bytes]] = {}
+        self._newest: dict[str, bytes] = {}
         self.trust = ""
         """Result of the model check, as text."""
 
@@ -100,10 +102,10 @@ class LearningStage:
             self._coming(f"{place}/surrogate", f"{name}: nothing was simulated or poured yet.")
             if plan.deployment is not None and plan.deployment.actions.dimension > MAPPED:
                 self._coming(f"{place}/slices", f"{name}: nothing was simulated or poured yet.")
+        self._keep()
 
     def _coming(self, place: str, text: str) -> None:
-        picture = png(words(text))
-        self._sink.log(f"{PLACE}/{place}", rr.EncodedImage(contents=picture, media_type="image/png"))
+        self._show(f"{PLACE}/{place}", png(words(text)))
 
     def about(self, stage: str, scene: str) -> None:
         """Associate a stage with a scene."""
@@ -180,9 +182,18 @@ class LearningStage:
                 self._number(place, z, label, style.ESCAPED, marker=8.0)
 
     def flush(self, now: float) -> None:
-        """Draw the pictures that were postponed."""
+        """Draw the pictures that were postponed, and keep the newest ones for a replay."""
         for entity, draw in list(self._waiting.items()):
             self._draw(entity, now, draw)
+        self._keep()
+
+    def _keep(self) -> None:
+        """Log the newest pictures for every position of a viewer's time cursor: a replay begins at 0, where the
+        timelines have none yet."""
+        for entity, picture in self._newest.items():
+            image = rr.EncodedImage(contents=picture, media_type="image/png")
+            self._sink.log(f"{OUTCOME}{entity}", image, static=True)
+        self._newest.clear()
 
     def _picture(self, entity: str, now: float, draw: Callable[[], bytes], interval: float = DRAWING_INTERVAL) -> None:
         if now - self._drawn.get(entity, -interval) < interval:
@@ -193,7 +204,11 @@ class LearningStage:
     def _draw(self, entity: str, now: float, draw: Callable[[], bytes]) -> None:
         self._waiting.pop(entity, None)
         self._drawn[entity] = now
-        self._sink.log(entity, rr.EncodedImage(contents=draw(), media_type="image/png"))
+        self._show(entity, draw())
+
+    def _show(self, entity: str, picture: bytes) -> None:
+        self._newest[entity] = picture
+        self._sink.log(entity, rr.EncodedImage(contents=picture, media_type="image/png"))
 
     def _number(
         self, entity: str, value: float, name: str, colour: str, *, marker: float = 0.0, width: float = 3.0

@@ -5,10 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import rerun.blueprint as rrb
 from matplotlib.collections import PathCollection, QuadMesh
 
 from actors.arm.arm_settings import arm_kind
@@ -18,6 +21,7 @@ from actors.optimizer.suggest import propose, slices
 from actors.runtime.child_process import child_environment
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.learning.requests import Pour, Simulate, Simulated, Suggest, Suggested
+from orchestrator.live_view.blueprints import campaign_blueprint
 from orchestrator.live_view.learning_view import slices_picture, surrogate_picture
 from orchestrator.live_view.rerun_subscriber import QueueThread, RerunMonitor
 from orchestrator.live_view.run_recording import CampaignRecording
@@ -153,6 +157,29 @@ def test_how_a_run_ended_is_shown_wherever_the_time_cursor_is(recorded: Contents
     assert pages[-1].startswith("# VIRTUAL: finished\n")
     assert " of " not in pages[-1].splitlines()[2], "the stage that was reached does not stand there as if it went on"
     assert "Best into narrow: 6.00 %" in pages[-1]
+
+
+def test_the_last_pictures_are_shown_wherever_the_time_cursor_is(recorded: Contents) -> None:
+    """A replay begins at 0, where the pictures on the time line are announcements."""
+    for place in ("calibration/surrogate", "narrow_cup/surrogate"):
+        entity = f"/learning/{place}"
+        assert not {"wall", "sim_time", "step"} & set(recorded.columns[f"/outcome{entity}"])
+        kept = recorded.values(f"/outcome{entity}", "EncodedImage:blob")
+        on_the_line = recorded.values(entity, "EncodedImage:blob")
+        assert bytes(kept[-1][0]) == bytes(on_the_line[-1][0])  # type: ignore[index]
+    replay = campaign_blueprint("replaying", {"narrow cup": "narrow"}, "loss").root_container.contents[-1]
+    pictures = [view.origin for view in views(replay) if isinstance(view, rrb.Spatial2DView)]
+    assert pictures
+    assert all(str(origin).startswith("/outcome/learning/") for origin in pictures)
+
+
+def views(container: Any) -> Iterator[Any]:
+    """All views in a container of a blueprint."""
+    for child in getattr(container, "contents", ()):
+        if hasattr(child, "origin"):
+            yield child
+        else:
+            yield from views(child)
 
 
 def test_lanes_of_the_machine_show_who_works_at_what(recorded: Contents) -> None:
