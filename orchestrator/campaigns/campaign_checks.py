@@ -157,7 +157,7 @@ def _landing(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> 
 
 
 def _too_fast(actions: Space, scene: Scene, name: str, most: float) -> Senseless | None:
-    """A range of speeds whose fastest part the arm refuses."""
+    """A range of speeds whose fastest part the arm would refuse."""
     axis = next((axis for axis in actions.axes if axis.name == name), None)
     if axis is None or axis.upper <= most * (1.0 + 1e-9):
         return None
@@ -175,8 +175,8 @@ def _too_fast(actions: Space, scene: Scene, name: str, most: float) -> Senseless
     return (
         _where(actions, name),
         f"goes up to {axis.upper / unit.factor:.4g} {unit.display_unit}, and the arm turns the pourer at "
-        f"{most / unit.factor:.4g} {unit.display_unit} at most (arm.limits.tilt_speed): faster actions are refused one "
-        "by one. End the range there",
+        f"{most / unit.factor:.4g} {unit.display_unit} at most (arm.limits.tilt_speed): the search "
+        "ends there",
     )
 
 

@@ -50,6 +50,9 @@ from sim_engine.scene import Scene
 from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.shapes import VesselSpec
 
+TILT_SPEEDS = ("angular_velocity", "return_velocity")
+"""Searched speeds of the tilt, which an arm limits."""
+
 
 @dataclass(frozen=True)
 class StageGround:
@@ -325,6 +328,12 @@ def resolve_campaign(
         calibration = replace(calibration, memory=memory, design=design, design_simulations=simulations)
     elif memory is not None and deployment is not None:
         deployment, in_force = replace(deployment, memory=memory), in_force | memory.means
+    if calibration is not None and calibration.records is None:
+        limits = _arm_limits(calibration.actions, laboratory)
+        calibration = replace(calibration, constraints=(*calibration.constraints, *limits))
+    if deployment is not None:
+        limits = _arm_limits(deployment.actions, laboratory)
+        deployment = replace(deployment, constraints=(*deployment.constraints, *limits))
     broken = any(report.is_broken(root.at(key)) for key in ("calibration", "deployment"))
     if not broken and (file.calibration is None or file.calibration.actions is not None):
         builder.refuse_prior(file.actions, root, "decides nothing: no calibration takes its actions from here")
@@ -369,6 +378,16 @@ def resolve_campaign(
         laboratory_source=(resolved(root.directory / file.laboratory) if isinstance(file.laboratory, str) else None),
         dispense=dispense,
         pour=pour,
+    )
+
+
+def _arm_limits(actions: Space, laboratory: LaboratorySettings | None) -> tuple[Linear, ...]:
+    """Constraints with which searched speeds end at the limit of the arm that will make the pours."""
+    limit = None if laboratory is None or laboratory.arm is None else laboratory.arm.tilt_speed_limit
+    return tuple(
+        Linear(((axis.name, 1.0),), limit)
+        for axis in actions.axes
+        if limit is not None and axis.name in TILT_SPEEDS and axis.lower < limit < axis.upper
     )
 
 

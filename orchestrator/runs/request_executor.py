@@ -360,7 +360,8 @@ class RequestExecutor:
     def _refusal(self, request: Simulate) -> asyncio.Future[str] | None:
         """Why the arm can't make the action as planned, once that is worked out next to the simulation; '' if it can.
         None: it will not be asked to."""
-        if self._arm is None or request.scene not in self._made_by_arm or request.pose_error is not None:
+        by_arm = request.scene in self._made_by_arm or request.purpose == "design"  # of a calibration's pours
+        if self._arm is None or not by_arm or request.pose_error is not None:
             return None
         key = request.scene, request.action
         if key not in self._refusals:

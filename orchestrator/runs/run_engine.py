@@ -181,7 +181,7 @@ class _RunEngine:
                 FRAME_RATE,
                 self._ask_operator,
                 repeats=self._plan.on_unknown == "repeat",
-                arm=self._plan.laboratory.arm,
+                arm=self._plan.laboratory.expected_arm,
                 made_by_arm=() if deployment is None else {scene.name for scene in deployment.scenes},
             )
             executor.speculation.changed = lambda running, waiting: self._journal.append(

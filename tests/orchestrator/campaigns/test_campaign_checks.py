@@ -4,14 +4,20 @@ bridges, tilts too fast.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from actors.optimizer.questions import Linear
 from orchestrator.campaigns.campaign_checks import check_campaign
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.yaml.yaml_errors import Problem
+from orchestrator.learning.deployment.d2 import D2Settings, RealOnly
+from orchestrator.runs.strategy_harness import StrategyHarness
 from tests.support.campaign_files import CAMPAIGN, RECORDED, write
+from tests.support.toy_spillage import narrow_cup
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 QUICKSTART = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
@@ -73,12 +79,25 @@ def test_tilts_faster_than_the_laboratory_allows_are_told_with_the_limit(tmp_pat
     (told,) = warnings(write(tmp_path, "bad.yaml", fast))
     assert told == (
         f"bad.yaml:{LINE - 1}:23: deployment.actions.angular_velocity: deployment into 'narrow': goes up to 200 deg/s, "
-        "and the arm turns the pourer at 160 deg/s at most (arm.limits.tilt_speed): faster actions are refused one "
-        "by one. End the range there"
+        "and the arm turns the pourer at 160 deg/s at most (arm.limits.tilt_speed): the search ends there"
     )
     # at 200 deg/s² a turn of 120 deg comes to 155 deg/s on its way
     slow = fast.replace("angular_acceleration: 600 deg/s^2", "angular_acceleration: 200 deg/s^2")
     assert warnings(write(tmp_path, "good.yaml", slow)) == []
+
+
+def test_a_search_without_simulations_ends_at_the_speed_of_the_arm_too(tmp_path: Path) -> None:
+    fast = QUICKSTART.replace("[50 deg/s, 150 deg/s]", "[50 deg/s, 300 deg/s]")
+    fast = fast.replace("[40 deg/s, 140 deg/s]", "[40 deg/s, 300 deg/s]")
+    plan = load_campaign(write(tmp_path, "fast.yaml", fast))
+    assert plan.calibration is not None
+    assert plan.deployment is not None
+    for stage in (plan.calibration, plan.deployment):
+        assert stage.constraints == (Linear((("angular_velocity", 1.0),), math.radians(160.0)),)
+    searching = replace(plan.deployment, settings=D2Settings(pours=12))
+    played = StrategyHarness(narrow_cup).run(RealOnly(searching, searching.scenes[0], plan.parameters, 3))
+    assert max(pour.action.angular_velocity for pour in played.pours) <= math.radians(160.0) + 1e-9
+    assert load_campaign(write(tmp_path, "slow.yaml", QUICKSTART)).deployment.constraints == ()
 
 
 def test_a_single_pour_whose_vessels_touch_is_refused_at_its_motion(folder: Path) -> None:

@@ -27,16 +27,18 @@ class Pool:
 
 
 @pytest.mark.parametrize(
-    ("speed", "of_the_deployment", "error", "outcome"),
+    ("speed", "of_the_deployment", "purpose", "error", "outcome"),
     [
-        (149.0, True, None, Simulated),
-        (151.0, True, None, Failed),
-        (151.0, False, None, Simulated),  # of pours that another arm has made
-        (151.0, True, PoseError(x=0.001), Simulated),  # an error of execution around an action that was refused as such
+        (149.0, True, "plan", None, Simulated),
+        (151.0, True, "plan", None, Failed),
+        (151.0, False, "plan", None, Simulated),  # of pours that another arm has made
+        (151.0, False, "design", None, Failed),  # of a calibration's pours, which this arm will make
+        # an error of execution around an action that was refused as such
+        (151.0, True, "plan", PoseError(x=0.001), Simulated),
     ],
 )
 def test_an_action_beyond_the_arm_is_refused_in_simulation_too(
-    speed: float, of_the_deployment: bool, error: PoseError | None, outcome: type[Any]
+    speed: float, of_the_deployment: bool, purpose: str, error: PoseError | None, outcome: type[Any]
 ) -> None:
     plan = decant.load_campaign(decant.shipped("campaigns/quickstart.yaml"))
     (scene,) = plan.deployment.scenes  # type: ignore[union-attr]
@@ -46,7 +48,7 @@ def test_an_action_beyond_the_arm_is_refused_in_simulation_too(
         laboratory, {scene.name: scene}, Deadlines(), 0.0, arm=plan.laboratory.arm, made_by_arm=made
     )
     action = scene.action({"angular_velocity": math.radians(speed), "x_offset": 0.1})
-    request = Simulate(scene.name, action, plan.parameters, 0, pose_error=error)
+    request = Simulate(scene.name, action, plan.parameters, 0, purpose, error)
     answer, _ = asyncio.run(executor.simulate(request, record=False, started=lambda: None))
     assert isinstance(answer, outcome)
     if isinstance(answer, Failed):
