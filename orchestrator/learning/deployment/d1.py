@@ -96,8 +96,8 @@ class OneShotPlanning(Deployment[D1Settings]):
     Bayesian optimisation of f̄_s(a) = 1/m1 Σ_j f_s(a, seed_j) with m1 simulations per iteration, starting at Sobol
     points instead of random ones; with `risk`, of a measure over disturbances (`RiskMeasure`). The last iteration
     simulates the minimiser of the posterior mean over the whole box. The recommended action is the simulated action
-    with the smallest posterior mean, and it is poured if the budget allows. It has thus been simulated, and is not
-    selected by a single low observation.
+    with the smallest posterior mean, or the gentlest of those that are equal to it (`Equality`), and it is poured if
+    the budget allows. It has thus been simulated, and is not selected by a single low observation.
 
     Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D1); that m1 simulations are averaged is our interpretation.
     Limitations: an error of the simulator is an error of the plan.
