@@ -161,6 +161,10 @@ UNREPORTED = 0.3
 SURELY = 3.0
 """Standard deviations within which a dose that gets no further command stays within its tolerance."""
 
+ABRUPT = 0.06
+"""Standard deviation of what an arm that turns back by itself adds, as a time of the flow [s]: it accelerates at once,
+and raises a wave at the lip."""
+
 LATEST_ONSET = math.radians(1.5)
 """Tilt by which outflow can begin later than expected, even after many doses: the lip may have dried [rad]."""
 
@@ -202,6 +206,10 @@ usual interval; in between, the second factor times the longest one so far."""
 
 DECREASE = 1e-3
 """Largest decrease of the reading over such a time; after a larger one the balance was set to zero [kg]."""
+
+RISES, UNEXPECTED = 3, 4.0
+"""Readings in a row that rise, and standard deviations between the last one and its prediction, from which the stream
+has begun before any particle expected it."""
 
 MOST_PAUSES = 6
 """Largest number of such interruptions of one dose."""
@@ -460,7 +468,7 @@ class DoseController:
                 acceleration=s.acceleration,
                 highest=highest,
             )
-            surely = median(final) + SURELY * self._spread(final)
+            surely = median(final) + self._aim() + SURELY * math.hypot(self._spread(final), ABRUPT * self.flow)
             if surely < self._order.amount + self._order.limit:
                 return float(patience)
         return least
@@ -510,8 +518,11 @@ class DoseController:
         # Growth dm/dθ = ρ (−dV/dθ) [kg/rad] of the flow's rate with the speed of the tilt
         aim = quantile(self._tilts_for(self.fine_flow), 0.35)
         growth = self._cup.volume_per_tilt(median(e.volume), 2e-3) * self._cup.density
-        # the flow at the moment when the stream is seen is about growth × speed × delay / lag of the cup
-        calm = 2.0 * self.fine_flow / growth * SEEN_AFTER / (SEEN_AFTER + self._blind())
+        # the flow at the moment when the stream is seen is about growth × speed × delay / lag of the cup; until the
+        # return has an effect, which takes as long again, a third of what is missing flows
+        delay, left = SEEN_AFTER + self._blind() + median(e.lag), self._order.amount - median(e.mass)
+        flow = min(2.0 * self.fine_flow * SEEN_AFTER / (SEEN_AFTER + self._blind()), left / (1.5 * delay))
+        calm = flow / growth
         search = min(self._settings.search_speed, max(calm, math.radians(0.8)))
         return min(max(3.0 * (aim - ahead), -0.2), search)
 
@@ -770,8 +781,12 @@ class DoseController:
             return
         self._unchanged_since = reading.time
         predicted = e.predicted(reading.time)
-        gate = max(5.0 * math.hypot(float(predicted.std()), e.deviation()), 1.5e-3 + 0.1 * self.flow)
+        deviation = math.hypot(float(predicted.std()), e.deviation())
+        gate = max(5.0 * deviation, 1.5e-3 + 0.1 * self.flow)
         expected = float(predicted.mean())
+        if net.mass - expected > UNEXPECTED * deviation and self._begins_to_rise():
+            e.flows_unexpectedly(net, self._rate(RISES))
+            expected = net.mass
         if abs(net.mass - expected) > gate:
             self._doubt_since = self._doubt_since if self._doubt_since is not None else reading.time
             most, least = OTHER_NUMBER * expected + FAR_OFF, expected / OTHER_NUMBER - FAR_OFF
@@ -780,12 +795,25 @@ class DoseController:
         else:
             self._doubt_since = None
         before = self._recent[-2].mass - self._zero if len(self._recent) > 1 else 0.0
-        base = self._late_mass if self._top_ups else 0.0
-        threshold = max(SEEN, 2.5 * self._step_size)
-        self._rising = (
-            self._rising + 1 if net.mass > before + 0.5 * self._step_size and net.mass > base + threshold else 0
-        )
+        rises = net.mass > before + 0.5 * self._step_size and net.mass > self._threshold
+        self._rising = self._rising + 1 if rises else 0
         self._innovations = [*self._innovations[-2:], e.update(net, seen=seen)]
+
+    @property
+    def _threshold(self) -> float:
+        """Net reading above which liquid has arrived [kg]."""
+        return (self._late_mass if self._top_ups else 0.0) + max(SEEN, 2.5 * self._step_size)
+
+    def _begins_to_rise(self) -> bool:
+        """Whether the last readings rise, faster than the particles flow and as slowly as a stream can."""
+        last = [reading.mass for reading in self._recent[-RISES:]]
+        rises = all(after > before + 0.5 * self._step_size for before, after in itertools.pairwise(last))
+        if self.phase not in (DosePhase.APPROACH, DosePhase.POUR) or len(last) < RISES or not rises:
+            return False
+        if self._tilt < self._onset - LATEST_ONSET:  # turned back meanwhile: the tilt says nothing of the onset
+            return False
+        plausible = 2.0 * self.flow < self._rate(RISES) < 2.0 * self._settings.largest_flow
+        return plausible and last[-1] - (self._zero or 0.0) > self._threshold
 
     def _pass_over(self, time: float, tilt: float) -> None:
         """Move the particles over a pause of the caller, in which the arm has turned back by itself."""
@@ -858,9 +886,9 @@ class DoseController:
         self._suspected, self._paused, self._doubted = suspected, True, True
         self._turn_back()
 
-    def _rate(self) -> float:
-        """Slope of the last readings [kg/s]."""
-        first, last = self._recent[max(len(self._recent) - 7, 0)], self._recent[-1]
+    def _rate(self, readings: int = 7) -> float:
+        """Slope of so many last readings [kg/s]."""
+        first, last = self._recent[max(len(self._recent) - readings, 0)], self._recent[-1]
         return (last.mass - first.mass) / (last.time - first.time) if last.time > first.time else math.inf
 
     def _nearly_empty(self) -> bool:

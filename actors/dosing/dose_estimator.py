@@ -536,6 +536,37 @@ class DoseEstimator:
         self.onset_bias = self.onset_bias + math.radians(0.6) * _even_normal(count, self._rng)
         self.flow_factor = np.clip(self.flow_factor * np.exp(0.1 * _even_normal(count, self._rng)), *FACTOR_RANGE)
 
+    def flows_unexpectedly(self, reading: DoseReading, rate: float) -> None:
+        """Let the particles pour a stream that arrived before any of them expected it.
+
+        An ensemble that does not flow has no covariance with a reading that rises, and would not follow it. The
+        particles get flows spread evenly between none and twice the observed one; `update` chooses among them.
+
+        Args:
+            reading: net of the receiver, which none of them predicts.
+            rate: at which the readings rise [kg/s].
+        """
+        # A stream with the constant flow ρq_i: a stage of the balance that lags by T_k shows m − ρq_i (t_f + T_k);
+        # onset b_i = θ − tilt(V, head(q_i / c_i))
+        share = self._rng.permutation((np.arange(len(self.mass)) + 0.5) / len(self.mass)) * 2.0
+        density, tilt = self.cup.density, self._tilt
+        flow = share * rate / density
+        head = self.cup.head_for(flow / self.flow_factor, tilt)
+        self.onset_bias = np.minimum(self.onset_bias, tilt - self.cup.tilt_for(self.volume, head))
+        shown = share * reading.mass
+        self.mass = shown + density * flow * (self._fall + self.lag)
+        self.flow = flow
+        slow, fast = self.lag_shape * self.lag, (1.0 - self.lag_shape) * self.lag / 3.0
+        for k in range(4):
+            late = self._fall + slow + k * fast
+            self._lags[k] = np.maximum(self.mass - density * flow * late, 0.0)
+        places = len(self._mass_history)
+        for age in range(places):
+            slot = (self._steps - age) % places
+            self._mass_history[slot] = np.maximum(self.mass - density * flow * age * TIME_STEP, 0.0)
+            self._flow_history[slot] = flow
+        self._before = np.maximum(self._lags[3] - density * flow * TIME_STEP, 0.0)
+
     def final_mass(
         self,
         tilt: float,
