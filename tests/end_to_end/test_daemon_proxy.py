@@ -1,10 +1,12 @@
-"""The recipe for nginx of docs/laboratory/security.md, as it is written there, on loopback."""
+"""The recipes for nginx and Caddy of docs/laboratory/security.md, as they are written there, on loopback."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
+import socket
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,36 +25,53 @@ pytestmark = pytest.mark.slow
 PAGE = Path(__file__).parents[2] / "docs" / "laboratory" / "security.md"
 
 
-def recipe(address: str, daemon: str) -> str:
-    """The server block of the page, without TLS and at other addresses."""
-    (block,) = re.findall(r"^```nginx\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+def recipe(proxy: str, address: str, daemon: str) -> str:
+    """The block of the page, without TLS and at other addresses."""
+    begins = {"nginx": "```nginx\n", "caddy": "```\n(?=lab.example.org {)"}[proxy]
+    (block,) = re.findall(rf"^{begins}(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    if proxy == "caddy":
+        block = block.replace("lab.example.org {", f"http://lab.example.org:8080 {{\n    bind {address}")
+        return block.replace("127.0.0.1:8377", daemon.removeprefix("http://"))
     block = re.sub(r"^\s*ssl_.*\n", "", block, flags=re.MULTILINE)
     return block.replace("listen 443 ssl", f"listen {address}:8080").replace("http://127.0.0.1:8377", daemon)
 
 
-@pytest.fixture
-def proxied(tmp_path: Path) -> Iterator[tuple[Real, str]]:
-    nginx = shutil.which("nginx") or shutil.which("/usr/sbin/nginx")
-    if nginx is None:
-        pytest.skip("the recipe for nginx was not tested: it is not installed (apt-get install nginx)")
-    real, address = Real(tmp_path / "state", names=("lab.example.org",)), free_address()
+def served(proxy: str, folder: Path, text: str) -> list[str]:
+    """Write the configuration of a proxy, and return the command that serves it."""
+    program = shutil.which(proxy) or shutil.which(f"/usr/sbin/{proxy}")
+    if program is None:
+        pytest.skip(f"the recipe for {proxy} was not tested: it is not installed (apt-get install {proxy})")
+    if proxy == "caddy":
+        (folder / "Caddyfile").write_text(f"{{\n    admin off\n}}\n{text}")
+        return [program, "run", "--config", str(folder / "Caddyfile")]
     paths = "".join(
-        f"{name}_temp_path {tmp_path}/{name};\n" for name in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+        f"{name}_temp_path {folder}/{name};\n" for name in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
     )
     user = "user root;\n" if os.geteuid() == 0 else ""
-    (tmp_path / "nginx.conf").write_text(
-        f"{user}pid {tmp_path}/pid;\nerror_log {tmp_path}/errors;\nevents {{}}\n"
-        f"http {{\naccess_log off;\n{paths}{recipe(address, real.url)}}}\n"
+    (folder / "nginx.conf").write_text(
+        f"{user}pid {folder}/pid;\nerror_log {folder}/errors;\nevents {{}}\nhttp {{\naccess_log off;\n{paths}{text}}}\n"
     )
-    command = [nginx, "-p", str(tmp_path), "-c", str(tmp_path / "nginx.conf"), "-g", "daemon off;"]
-    process = subprocess.Popen(command, env=child_environment())
-    try:
-        wait_for((tmp_path / "pid").exists)
-        yield real, f"http://{address}:8080"
-    finally:
-        process.terminate()
-        process.wait()
-        real.close()
+    return [program, "-p", str(folder), "-c", str(folder / "nginx.conf"), "-g", "daemon off;"]
+
+
+@pytest.fixture(params=["nginx", "caddy"])
+def proxied(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[Real, str]]:
+    address = free_address()
+    with contextlib.closing(Real(tmp_path / "state", names=("lab.example.org",))) as real:
+        command = served(request.param, tmp_path, recipe(request.param, address, real.url))
+        process = subprocess.Popen(command, env=child_environment() | {"XDG_DATA_HOME": str(tmp_path)})
+        try:
+            wait_for(lambda: answers(address))
+            yield real, f"http://{address}:8080"
+        finally:
+            process.terminate()
+            process.wait()
+
+
+def answers(address: str) -> bool:
+    """Whether something listens there."""
+    with socket.socket() as line:
+        return line.connect_ex((address, 8080)) == 0
 
 
 def test_the_recipe_passes_requests_events_and_the_stop_on(proxied: tuple[Real, str]) -> None:
@@ -71,6 +90,7 @@ def test_the_recipe_passes_requests_events_and_the_stop_on(proxied: tuple[Real, 
         assert large.status_code == 409  # of the emergency stop: the proxy has passed it on
 
 
+@pytest.mark.parametrize("proxied", ["nginx"], indirect=True)  # Caddy passes on no other name
 def test_another_name_is_refused_with_the_key_that_allows_it(proxied: tuple[Real, str]) -> None:
     _, url = proxied
     answer = httpx.get(f"{url}/api/v1/status", headers={"Host": "other.example.org"})

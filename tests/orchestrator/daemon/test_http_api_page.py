@@ -579,6 +579,34 @@ def test_a_night_is_one_timeline_of_pours_masses_faults_and_answers(page: Any, t
 
 
 @pytest.mark.slow
+def test_the_question_about_an_unknown_dose_is_answered_on_a_phone_without_scrolling(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path, held_dose, campaign=MIXTURES) as lab:
+        key = lab.do(lab.served.submit())
+        lab.do(lab.served.pouring())
+        for _ in range(2):
+            lab.do(lab.served.post(f"/campaigns/{key}/abort"))
+        lab.do(lab.served.until(key, "unknown"))
+        lab.do(lab.served.post(f"/campaigns/{key}/resume"))
+        details = lab.do(lab.served.question())["details"]
+        assert {"liquid", "from", "into", "wanted_g", "last_reading_g", "load_g", "diagnostics"} <= details.keys()
+        width, height = SIZES["phone"]
+        page.set_viewport_size({"width": width, "height": height})
+        page.goto(lab.address())
+        field = page.get_by_label("Received by the cup")
+        field.wait_for()
+        card = page.locator("article.question")
+        card.evaluate("card => card.scrollIntoView()")
+        top, last = card.bounding_box()["y"], page.get_by_role("button", name="Send the weight").bounding_box()
+        assert last["y"] + last["height"] - top <= height
+        assert page.get_by_text("bench: simulated").is_hidden()  # diagnostics are folded
+        page.get_by_text("What arm and balance show now").click()
+        page.get_by_text("bench: simulated").wait_for()
+        field.fill("19.5")
+        page.get_by_role("button", name="Send the weight").click()
+        wait_until(page, lambda: rack_of(page)["B2"] != "UNKNOWN")
+
+
+@pytest.mark.slow
 def test_a_pour_without_outcome_reads_unknown_while_its_question_is_open(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path) as lab:
         key = lab.do(lab.served.submit())
