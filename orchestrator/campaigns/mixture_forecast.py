@@ -6,8 +6,10 @@ is known yet; the errors of the doses between are interpolated. Later doses are 
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
+import pickle
 from collections import Counter
 from collections.abc import Callable, Iterable
 
@@ -77,7 +79,7 @@ class MixtureForecast:
         scene = self._series.scene(self._series.sources_of(dose)[0], dose.receiver)
         source = DoseSource(scene.pourer.name, scene.liquid.mass, FILL_DEVIATION, fill=True, constants=0)
         target = DoseTarget(dose.amount, dose.limit, dose.position, source)
-        return predicted_dose(self._laboratory, scene, target, seed, PREDICTED)
+        return _predicted(pickle.dumps((self._laboratory, scene, target, seed)))
 
     def _fillings(self, seed: int) -> Counter[str]:
         strategy, fills = dose_strategy(self._series, seed), Counter[str]()
@@ -166,6 +168,17 @@ class MixtureForecast:
             f"composition: shares by mass within ± {100.0 * half:.1f} percentage points (90 %); the least certain is "
             f"{liquid} in {cup}, {100.0 * share:.1f} %"
         )
+
+
+@functools.lru_cache(maxsize=256)
+def _predicted(asked: bytes) -> DoseForecast:
+    """A prediction, made once in a process: a campaign is checked when it is submitted, and again when it begins.
+
+    Args:
+        asked: pickled laboratory, scene, dose and seed.
+    """
+    laboratory, scene, dose, seed = pickle.loads(asked)
+    return predicted_dose(laboratory, scene, dose, seed, PREDICTED)
 
 
 def _half(amount: float, predicted: DoseForecast) -> float:

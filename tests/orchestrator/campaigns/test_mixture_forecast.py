@@ -74,12 +74,15 @@ def test_what_is_expected_does_not_depend_on_the_seed(tmp_path: Path) -> None:
     assert checked(tmp_path, "name: mix", "name: mix\nseed: 1") == checked(tmp_path, "name: mix", "name: mix\nseed: 2")
 
 
-def test_later_doses_cost_no_further_predictions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_later_doses_and_a_second_check_cost_no_further_predictions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "mix.yaml"
     rows = "".join(f"    B{i}: {{water: {20 + i} g, ethanol: {20 + i / 2} g}}\n" for i in range(1, 20))
     path.write_text(CAMPAIGN.replace("outputs", rows + "outputs"), encoding="utf-8")
     from orchestrator.campaigns import mixture_forecast
 
+    mixture_forecast._predicted.cache_clear()
     calls = []
     original = mixture_forecast.predicted_dose
     monkeypatch.setattr(mixture_forecast, "predicted_dose", lambda *a: calls.append(a) or original(*a))
@@ -87,6 +90,8 @@ def test_later_doses_cost_no_further_predictions(tmp_path: Path, monkeypatch: py
     MixtureForecast(load_campaign(path), said.append)
     assert said[0] == "predicting the doses of the mixtures, 1 of 4: 20 g of ethanol"
     assert len(said) == len(set(said)) == 4
+    assert len(calls) == 4
+    MixtureForecast(load_campaign(path))
     assert len(calls) == 4
 
 
