@@ -471,11 +471,14 @@ def standing(record: RunState, run: str) -> list[str]:
         return []
     again = f"the command that began it, with '--resume --run {run}' added"
     lines = [f"This run is not finished. Its state is '{state}'{f': {record.reason}' if record.reason else ''}."]
-    unknown = [f"pour {pour.request.number} of {pour.stage}" for pour in record.unknown_pours]
-    if unknown:
+    for pour in record.unknown_pours:
+        dose = pour.request.dose
+        weigh = "the spilled liquid and the liquid in the pourer"
+        if dose is not None:
+            weigh = "the content of " + (f"'{dose.position}'" if dose.position else "the receiver")
         lines.append(
-            f"{' and '.join(unknown).capitalize()} had begun, and its outcome is not known. The software does "
-            "not repeat it. Weigh the spilled liquid and the liquid in the pourer, and give the answer on resuming."
+            f"{'Pour' if dose is None else 'Dose'} {pour.request.number} of {pour.stage} had begun, and its outcome is "
+            f"not known. The software does not repeat it. Weigh {weigh}, and give the answer on resuming."
         )
     lines += [f"A question is open: {q.text}" for q in record.questions if q.answer is None]
     match state:

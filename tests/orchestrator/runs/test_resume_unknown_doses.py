@@ -28,7 +28,7 @@ from orchestrator.records.journal import Header
 from orchestrator.records.run_record import RunState
 from orchestrator.reports.mixture_report import mixture_rows
 from orchestrator.reports.summarise import pour_summaries
-from orchestrator.reports.wording import cost
+from orchestrator.reports.wording import cost, standing
 from orchestrator.runs.resume import (
     LOST,
     RECEIVED,
@@ -107,6 +107,20 @@ def test_the_question_names_cup_liquid_amount_and_last_reading_and_what_to_weigh
         "held_before_g": 10.2,
         "load_g": 300.0,  # of this source, not of another liquid's
     }
+
+
+def test_a_report_of_a_run_with_an_unknown_dose_says_which_cup_is_to_be_weighed() -> None:
+    pour, _ = mixtures.asked(Mix(SERIES, 5))
+    record = RunState(Header("mix", {}))
+    for event in (
+        StageOpened(stage="doses", seed=5),
+        Requested(stage="doses", id=1, request=pour),
+        RequestStarted(stage="doses", id=1, request=pour),
+    ):
+        record.take(event)
+    said = " ".join(standing(record, "mix-1"))
+    assert "Dose 1 of doses had begun, and its outcome is not known." in said
+    assert "Weigh the content of 'rack/A1', and give the answer on resuming." in said
 
 
 def test_the_last_reading_is_in_the_journal() -> None:
