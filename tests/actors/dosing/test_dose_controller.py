@@ -165,6 +165,33 @@ def test_a_knock_on_the_balance_does_not_end_the_dose_early_or_late() -> None:
     assert record.received == pytest.approx(0.1, abs=1.5e-3)
 
 
+@pytest.mark.parametrize("factor", [10.0, 0.1])
+@pytest.mark.parametrize(
+    ("phase", "place"), [(DosePhase.POUR, 2), *((DosePhase.SETTLE, place) for place in (2, 8, 14, 20, 26))]
+)
+def test_one_reading_that_is_wrong_by_a_factor_of_ten_misleads_no_dose(
+    phase: DosePhase, place: int, factor: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken, seen = DoseController._take, 0
+    damaged: list[float] = []
+
+    def take(self: DoseController, reading: DoseReading, tilt: float, now: float) -> None:
+        nonlocal seen
+        net = reading.mass - (self._zero or 0.0)
+        seen += self.phase is phase
+        if seen == place and not damaged:
+            damaged.append(reading.mass)
+            reading = replace(reading, mass=reading.mass + (factor - 1.0) * net)
+        taken(self, reading, tilt, now)
+
+    monkeypatch.setattr(DoseController, "_take", take)
+    record, controller = one_dose(0.01)
+    assert damaged
+    assert controller.result is not None
+    assert record.received == pytest.approx(0.01, abs=2e-3)
+    assert controller.result.amount == pytest.approx(record.received, abs=0.3e-3)
+
+
 def test_an_unstable_balance_pours_nothing() -> None:
     record, controller = one_dose(0.05, DosingFault("unstable"))
     assert controller.result is not None
