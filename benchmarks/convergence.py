@@ -5,7 +5,7 @@
     python benchmarks/convergence.py --store FILE --halves [--particles 1000 2000 5000 10000] [--seeds 30]
     python benchmarks/convergence.py --store FILE --fine [--finest 10000 20000 40000 80000] [--seeds 3]
 
-Nineteen pours (`sim_engine.validation.convergence`) are simulated at each number of particles: the coarse ones with
+Nineteen pours (`validation.convergence`) are simulated at each number of particles: the coarse ones with
 several seeds, the finest once. Finished simulations are in the store, so an interrupted measurement continues.
 `--write` makes no runs; it writes the table to docs/data/results.json.
 
@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 from machine import KeptRows, write_table
+from validation.convergence import POURS, ConvergencePour, has_converged, spillage
 
 from orchestrator.learning import single_action
 from sim_engine.fluid import engine
@@ -35,7 +36,6 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.prediction_band import band, shift_of
 from sim_engine.scene import MIRRORED_FROM
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation.convergence import POURS, ConvergencePour, has_converged, spillage
 
 CONVERGED = 0.02
 FINE = 10_000

@@ -177,7 +177,7 @@ def density_inside(points: Floats, time_: float, particles: int) -> float:
     Returns:
         Mean volume per particle divided by that of its Voronoi cell; nan if no particle is that far inside.
     """
-    from sim_engine.validation.hydrostatic_cases import INNER, mean_density
+    from validation.hydrostatic_cases import INNER, mean_density
 
     d = particle_spacing(particles)
     local = in_frame(points, time_)

@@ -1,6 +1,6 @@
-"""Make docs/evidence/validation.md with its pictures from the results of `decant validate-solver --full --json`.
+"""Make docs/evidence/validation.md with its pictures from the results of the solver's cases.
 
-    decant validate-solver --full --json > results.json
+    python -m benchmarks.validation --full --json > results.json
     python docs/make_validation.py results.json            # also draws the pictures of these cases
     python docs/make_validation.py                         # writes the page again from docs/data/validation.json
     python docs/make_validation.py --draw                  # and draws all pictures
@@ -20,12 +20,14 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from orchestrator.extra_commands.physics_command import shown
 from orchestrator.reports import figure_style
-from sim_engine.validation.case_result import Figure, Series
-from sim_engine.validation.cases import CASES, PLAIN, describe
 
 DOCS = Path(__file__).resolve().parent
+sys.path.insert(0, str(DOCS.parent))
+
+from benchmarks.validation.__main__ import shown  # noqa: E402
+from benchmarks.validation.case_result import Figure, Series  # noqa: E402
+from benchmarks.validation.cases import CASES, PLAIN, describe  # noqa: E402
 
 PAGE_NAME, DATA_NAME, IMAGES = "evidence/validation.md", "data/validation.json", "images"
 
@@ -41,7 +43,7 @@ FEW = 20
 MOST_PLACES = 5
 """Maximum number of labelled points of a logarithmic axis; with more points, round numbers are labelled."""
 
-AGAIN = "decant validate-solver --json"
+AGAIN = "python -m benchmarks.validation --json"
 
 REFERENCES = (("--", "o"), (":", "s"), ("-.", "^"), ((0, (6, 2)), "D"))
 """Line style, or marker for few points, of several references in a panel."""
@@ -61,11 +63,11 @@ beforehand. These commands measure everything and write the page:
 
 <!-- needs: checkout and minutes -->
 ```
-decant validate-solver --full --json > results.json
+python -m benchmarks.validation --full --json > results.json
 python docs/make_validation.py results.json
 ```
 
-`decant validate-solver CASE` runs one case. Comparisons with liquids that were really poured: [real
+`python -m benchmarks.validation CASE` runs one case. Comparisons with liquids that were really poured: [real
 recordings](recordings.md). All values are in [validation.json](../data/validation.json). A row of several quantities
 has the values that fail; if all pass, the one with the largest difference from its reference.
 

@@ -47,12 +47,12 @@ within the length l ≈ 3e in which it accelerates at about Re = 75; above, the 
 For liquids as thin as water only; for others viscosity is simulated, …"""
 
 CREEPING = 2.0
-"""… up to this viscosity [Pa s], the largest that was compared with theory (`decant validate-solver film`) …"""
+"""… up to this viscosity [Pa s], the largest that was compared with theory (`benchmarks.validation film`) …"""
 
 ADDED = 3.0
 """… and above the kinematic viscosity ADDED · d² [m²/s] that the solver itself adds at a spacing d: vortices of
 10 mm²/s decay as those of 110, 84, 50 and 49 mm²/s at spacings of 6.9, 5.8, 4.6 and 2.9 mm (0.2 m/s;
-`sim_engine.validation.viscous_flows.own_viscosity`) …"""
+`benchmarks.validation.viscous_flows.own_viscosity`) …"""
 
 LEAST_ADDED = 40e-6
 """… and never less than this [m²/s]."""

@@ -45,7 +45,7 @@ LEVEL = 0.9
 
 RESOLUTION, RESOLUTION_AT = 0.25, 1_000
 """Shift caused by coarse particles (standard deviation), and the number of particles at which it was measured. It is
-about the root mean square of Φ⁻¹(r) − Φ⁻¹(fine) over those of the nineteen pours of `sim_engine.validation.convergence`
+about the root mean square of Φ⁻¹(r) − Φ⁻¹(fine) over those of the nineteen pours of `benchmarks.validation.convergence`
 that spill more than one in a thousand (fifteen), with the spillage of 10,000 particles as `fine`. Among pours that have
 converged it is half of it; splashes, which do not converge, differ more. With 500 particles it was 0.32: the error
 decreases with the spacing, as N^(−1/3)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import sys
@@ -11,16 +12,14 @@ from typing import Any
 
 import pytest
 from matplotlib.text import Text
-from typer.testing import CliRunner
 
-from orchestrator.cli.app import app
-from orchestrator.extra_commands.physics_command import case_record
+from benchmarks.validation import cases as suite
+from benchmarks.validation.__main__ import case_record
+from benchmarks.validation.__main__ import main as validate
+from benchmarks.validation.case_result import CaseEffort, Figure, Measurement, Series, reported, within
 from orchestrator.reports import figure_style as style
 from orchestrator.reports.figure_style import INK
-from sim_engine import solver_fingerprint as sources
-from sim_engine.validation import cases as suite
-from sim_engine.validation.case_result import CaseEffort, Figure, Measurement, Series, reported, within
-from tests.orchestrator.extra_commands.test_physics_command import FIGURE, a_case, height, two_cases  # noqa: F401
+from tests.benchmarks.validation.test_main import FIGURE, a_case, height, two_cases  # noqa: F401
 from tests.support.example_results import strays
 
 ROOT = Path(__file__).parents[1]
@@ -36,7 +35,8 @@ def test_the_page_keeps_other_cases_and_marks_those_that_another_solver_measured
 ) -> None:
     def measure(case: str) -> None:
         results = tmp_path / "results.json"
-        results.write_text(CliRunner().invoke(app, ["validate-solver", case, "--json"]).stdout, encoding="utf-8")
+        with results.open("w", encoding="utf-8") as written, contextlib.redirect_stdout(written):
+            validate([case, "--json"])
         make_validation.main([str(results)], tmp_path)
 
     monkeypatch.setattr(make_validation, "CASES", suite.CASES)
@@ -47,7 +47,7 @@ def test_the_page_keeps_other_cases_and_marks_those_that_another_solver_measured
     assert "1 of 2 criteria are met" in page
     assert "| height | 2,000 | 50 mm (**fails**) | 39.8 mm | within 2 % | **0 of 1** |" in page
     assert (tmp_path / "images" / "validation-good.png").read_bytes()[:4] == b"\x89PNG"
-    monkeypatch.setattr(sources, "solver_fingerprint", lambda: "another")
+    monkeypatch.setattr("benchmarks.validation.__main__.solver_fingerprint", lambda: "another")
     measure("good")
     marked = (tmp_path / make_validation.PAGE_NAME).read_text(encoding="utf-8")
     assert "†" not in page

@@ -122,17 +122,6 @@ class SimulateOutput(CommandOutput):
     """Effects of this pour that are not simulated: `kind`, `share`, `text`."""
 
 
-class ValidateSolverOutput(CommandOutput):
-    """Results of the solver's validation cases."""
-
-    solver: str
-    """Fingerprint of the solver's source."""
-
-    full: bool
-    cases: dict[str, dict[str, Any]]
-    """By case: title, cpu_s, figure, and measurements with value, bounds and whether they passed."""
-
-
 class PluginsOutput(CommandOutput):
     """Plug-ins of installed packages."""
 

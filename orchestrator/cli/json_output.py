@@ -18,7 +18,6 @@ from orchestrator.cli.command_results import (
     CommandOutput,
     PluginsOutput,
     SimulateOutput,
-    ValidateSolverOutput,
 )
 from orchestrator.daemon.api.schemas import CampaignDetailOut, CampaignOut, StatusOut
 from orchestrator.daemon.state.daemon_store import QuestionOut
@@ -126,7 +125,6 @@ OUTPUTS: dict[str, Any] = {
     "plan": PlanOutput,
     "simulate": SimulateOutput,
     "plugins": PluginsOutput,
-    "validate-solver": ValidateSolverOutput,
     "runs list": RunsOutput,
     "runs pours": PoursOutput,
     "runs show": PreviousRunDetail,

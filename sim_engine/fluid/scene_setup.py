@@ -23,7 +23,7 @@ RANGE = 3.0
 """Range of cohesion over spacing d."""
 SURFACE = 0.66
 """Energy of a surface of one spacing squared by the sums of `tension`: scales cohesion to its tension. Measured by the
-frequency of drops (`sim_engine.validation.capillarity`)."""
+frequency of drops (`benchmarks.validation.capillarity`)."""
 CAPILLARY = 0.56
 """Longest interval of cohesion, as a fraction of the capillary time; at 0.9 of it drops heat up."""
 APART = 0.6

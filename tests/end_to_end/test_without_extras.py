@@ -25,7 +25,6 @@ EXTRAS = (
     "orchestrator/extra_commands",
     "orchestrator/recordings",
     "orchestrator/study",
-    "sim_engine/validation",
     "sim_engine/vessel_acquisition",
 )
 
@@ -87,7 +86,7 @@ def test_commands_of_missing_packages_are_not_listed(core: Path, tmp_path: Path)
     result = decant(core, tmp_path, "--help")
     commands = {line.split()[1] for line in result.stdout.splitlines() if line.startswith("│ ") and line[2] != " "}
     assert {"run", "plan", "robot", "queue"} <= commands
-    assert not {"study", "vessel", "validate-solver", "recording"} & commands
+    assert not {"study", "vessel", "recording"} & commands
 
 
 def test_a_laboratory_with_emulated_devices_is_refused_with_a_remedy(core: Path, tmp_path: Path) -> None:

@@ -32,6 +32,8 @@ from sim_engine.scene import PourTask
 from sim_engine.simulator import PourSimulator
 from tests.support.waiting import PATIENCE
 
+ROOT = Path(__file__).parents[2]
+
 POUR = """
 import json, sys
 from sim_engine.engine_package import check_task, engine_version
@@ -170,7 +172,6 @@ def test_both_engines_pour_the_same_and_pass_quick_cases(engine: str) -> None:
     assert found["imported"] == [engine]
     expected, most = EXPECTED["retained"]
     assert abs(found["retained"] - expected) <= most
-    code = "from orchestrator.cli.app import main; main()"
-    command = [sys.executable, "-c", code, "validate-solver", "rest", "outflow"]
-    judged = subprocess.run(command, env=env, capture_output=True, text=True, timeout=900)
+    command = [sys.executable, "-m", "benchmarks.validation", "rest", "outflow"]
+    judged = subprocess.run(command, env=env, cwd=ROOT, capture_output=True, text=True, timeout=900)
     assert judged.returncode == 0, judged.stdout + judged.stderr

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.validation.convergence import FINE
 from sim_engine.liquids import Liquid
 from sim_engine.prediction_band import CalibrationResidual, band, left_over, resolution_shift
 from sim_engine.scene import Scene
-from sim_engine.validation.convergence import FINE
 from sim_engine.vessel.shapes import VesselSpec, cylinder
 
 PHI = NormalDist()

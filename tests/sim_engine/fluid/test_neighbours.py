@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.validation.container_runs import EMPTY_SPACE, block, run, stir
 from sim_engine.action import DEG, Action
 from sim_engine.fluid.engine import engine
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation.container_runs import EMPTY_SPACE, block, run, stir
 from sim_engine.vessel.shapes import cylinder
 
 MIRROR = np.array([1.0, -1.0, 1.0], np.float32)

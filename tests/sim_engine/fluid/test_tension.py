@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.validation.container_runs import DENSITY, FAR_AWAY, NO_RIM, NOTHING, still_pose
 from sim_engine.fluid.engine import engine
 from sim_engine.fluid.kernels import BULK_BOND, HALF_ATTRACTION
 from sim_engine.fluid.scene_setup import RANGE, SceneSetup, SolidWalls, cohesion_acceleration
 from sim_engine.fluid.tension import ALONE, BLUNT, BONDED, CALM
 from sim_engine.fluid.walls import FAR
 from sim_engine.liquids import SimulationParameters
-from sim_engine.validation.container_runs import DENSITY, FAR_AWAY, NO_RIM, NOTHING, still_pose
 
 Floats = NDArray[np.float64]
 

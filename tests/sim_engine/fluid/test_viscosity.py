@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import pytest
 
+from benchmarks.validation import capillarity as wetting
+from benchmarks.validation import viscous_flows as films
+from benchmarks.validation import viscous_flows as thick
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import THIN, Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation import capillarity as wetting
-from sim_engine.validation import viscous_flows as films
-from sim_engine.validation import viscous_flows as thick
 from sim_engine.vessel.shapes import cylinder
 
 PLAIN = SimulationParameters(cohesion=0.0, xsph_rate=0.0)

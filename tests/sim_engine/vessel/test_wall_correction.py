@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_engine.validation.container_runs import box, holed_cup
+from benchmarks.validation.container_runs import box, holed_cup
 from sim_engine.vessel import wall_correction as corners
 from sim_engine.vessel.shapes import cylinder
 from sim_engine.vessel.vessel import build_vessel

@@ -18,8 +18,9 @@ from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import SimulatedPour
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation.case_result import Figure, Measurement, Series, at_least, at_most, reported, within
 from sim_engine.vessel.shapes import cylinder
+
+from .case_result import Figure, Measurement, Series, at_least, at_most, reported, within
 
 TIMES = (2.3, 2.7, 3.1)
 LEFT = (0.945, 0.675, 0.31)

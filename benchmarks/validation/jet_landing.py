@@ -18,9 +18,10 @@ from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import ParticleState
 from sim_engine.scene import PoseError, PourTask, Scene
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation.case_result import Figure, Measurement, Series, reported, within
-from sim_engine.validation.convergence import CONE, POURER, ConvergencePour
-from sim_engine.validation.whole_pours import simulated
+
+from .case_result import Figure, Measurement, Series, reported, within
+from .convergence import CONE, POURER, ConvergencePour
+from .whole_pours import simulated
 
 Floats = NDArray[np.float64]
 

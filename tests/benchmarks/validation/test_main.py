@@ -1,20 +1,15 @@
-"""`physics_command`: `decant validate-solver`: what a person sees of the solver's cases."""
+"""`python -m benchmarks.validation`: what a person sees of the solver's cases."""
 
 from __future__ import annotations
 
+import json
 import math
-from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from orchestrator.cli.app import app
-from sim_engine.validation import cases as suite
-from sim_engine.validation.case_result import CaseEffort, CaseResult, Figure, Measurement, Series, reported, within
-from tests.support.output_schema import validated
-
-ROOT = Path(__file__).parents[3]
-runner = CliRunner()
+from benchmarks.validation import cases as suite
+from benchmarks.validation.__main__ import main
+from benchmarks.validation.case_result import CaseEffort, CaseResult, Figure, Measurement, Series, reported, within
 
 FIGURE = Figure(
     ("Heights",),
@@ -42,20 +37,21 @@ def two_cases(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("two_cases")
-def test_a_criterion_that_is_not_met_is_shown_and_ends_with_code_1() -> None:
-    result = runner.invoke(app, ["validate-solver"])
-    assert result.exit_code == 1
-    rows = [line for line in result.stdout.splitlines() if "height" in line]
+def test_a_criterion_that_is_not_met_is_shown_and_ends_with_code_1(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 1
+    shown = capsys.readouterr()
+    rows = [line for line in shown.out.splitlines() if "height" in line]
     assert ["39.7 mm" in rows[0], "pass" in rows[0]] == [True, True]
     assert ["50 mm" in rows[1], "FAIL" in rows[1]] == [True, True]
-    assert "1 of 2 criteria are not met" in result.stderr
+    assert "1 of 2 criteria are not met" in shown.err
 
 
 @pytest.mark.usefixtures("two_cases")
-def test_a_case_alone_passes_and_its_json_is_valid() -> None:
-    result = runner.invoke(app, ["validate-solver", "good", "--json"])
-    assert result.exit_code == 0
-    data = validated("validate-solver", result.stdout)
+def test_a_case_alone_passes_and_its_json_has_no_nan(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["good", "--json"]) == 0
+    data = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert list(data["cases"]) == ["good"]
     measured, spread = data["cases"]["good"]["measurements"]
     assert measured["value"] == 0.0397
@@ -63,30 +59,36 @@ def test_a_case_alone_passes_and_its_json_is_valid() -> None:
 
 
 @pytest.mark.parametrize("repeated", [False, True])
-def test_a_full_run_repeats_the_case_with_the_mirrored_liquid(monkeypatch: pytest.MonkeyPatch, repeated: bool) -> None:
+def test_a_full_run_repeats_the_case_with_the_mirrored_liquid(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], repeated: bool
+) -> None:
     def work(simulator: object, effort: CaseEffort) -> tuple[list[Measurement], None]:
         return [height(0.05 if effort.mirrored else 0.0397)], None
 
     monkeypatch.setattr(suite, "CASES", (suite.Case("rest", "Rest", "Liquid stands.", work, repeated),))
-    assert runner.invoke(app, ["validate-solver"]).exit_code == 0
-    result = runner.invoke(app, ["validate-solver", "--full"])
-    assert ("height, mirrored" in result.stdout, result.exit_code) == (repeated, int(repeated))
-    assert f"{1 + repeated} criteria" in result.stderr
+    assert main([]) == 0
+    capsys.readouterr()
+    code, shown = main(["--full"]), capsys.readouterr()
+    assert ("height, mirrored" in shown.out, code) == (repeated, int(repeated))
+    assert f"{1 + repeated} criteria" in shown.err
 
 
-def test_a_wrong_name_is_refused_before_anything_runs() -> None:
-    wrong = runner.invoke(app, ["validate-solver", "slosh"])
-    assert wrong.exit_code == 2
-    assert "no case 'slosh'; there are rest," in wrong.stderr
+def test_a_wrong_name_is_refused_before_anything_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["slosh"])
+    assert ended.value.code == 2
+    assert "no case 'slosh'; there are rest," in capsys.readouterr().err
 
 
-def test_a_case_without_criteria_is_judged_by_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_case_without_criteria_is_judged_by_nothing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def work(simulator: object, effort: CaseEffort) -> tuple[list[Measurement], None]:
         return [reported("slope", 0.1, particles=500)], None
 
     monkeypatch.setattr(suite, "CASES", (suite.Case("long", "Long", "It takes its time.", work),))
-    result = runner.invoke(app, ["validate-solver"])
-    assert (result.exit_code, result.stderr.splitlines()[-1]) == (0, "nothing was judged")
+    assert main([]) == 0
+    assert capsys.readouterr().err.splitlines()[-1] == "nothing was judged"
 
 
 def test_a_fault_of_the_solver_does_not_pass() -> None:

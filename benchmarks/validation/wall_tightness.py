@@ -18,10 +18,11 @@ from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import PourOutcome
 from sim_engine.scene import MIRRORED_FROM, PourTask, Scene
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation.case_result import Measurement, at_most, reported
-from sim_engine.validation.whole_pours import simulated
 from sim_engine.vessel.shapes import ProfileShape, VesselError, VesselSpec
 from sim_engine.vessel.vessel import build_vessel
+
+from .case_result import Measurement, at_most, reported
+from .whole_pours import simulated
 
 ATTEMPTS = 40
 """Largest number of draws until one is a possible pour."""

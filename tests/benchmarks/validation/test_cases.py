@@ -1,4 +1,4 @@
-"""`cases`: the solver against physics: the quick part of `decant validate-solver`; the full one is marked slow."""
+"""`cases`: the solver against physics: the quick part of the validation; the full one is marked slow."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.validation import capillarity as droplet
+from benchmarks.validation import cases as suite
+from benchmarks.validation import container_runs as stage
+from benchmarks.validation import container_runs as tanks
+from benchmarks.validation import convergence, dam_break, sloshing, torricelli
+from benchmarks.validation import hydrostatic_cases as at_rest
+from benchmarks.validation import hydrostatic_cases as tilting
+from benchmarks.validation import jet_landing as landing
+from benchmarks.validation import wall_tightness as walls
+from benchmarks.validation import whole_pours as pours
+from benchmarks.validation.case_result import CaseEffort, Measurement, at_least, at_most, reported, within
 from sim_engine.fluid.engine import engine
 from sim_engine.liquids import SimulationParameters
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation import capillarity as droplet
-from sim_engine.validation import cases as suite
-from sim_engine.validation import container_runs as stage
-from sim_engine.validation import container_runs as tanks
-from sim_engine.validation import convergence, dam_break, sloshing, torricelli
-from sim_engine.validation import hydrostatic_cases as at_rest
-from sim_engine.validation import hydrostatic_cases as tilting
-from sim_engine.validation import jet_landing as landing
-from sim_engine.validation import wall_tightness as walls
-from sim_engine.validation import whole_pours as pours
-from sim_engine.validation.case_result import CaseEffort, Measurement, at_least, at_most, reported, within
 
 STICKY = SimulationParameters(cohesion=0.0, xsph_rate=1.0, friction=1.0)
 

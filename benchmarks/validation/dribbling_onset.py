@@ -20,8 +20,9 @@ from sim_engine.lip_flow import film_of_flow, weber
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PourTask
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation.case_result import Figure, Measurement, Series, reported, within
-from sim_engine.validation.whole_pours import SCENE, simulated
+
+from .case_result import Figure, Measurement, Series, reported, within
+from .whole_pours import SCENE, simulated
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import MIRRORED_FROM
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation import (
+
+from . import (
     capillarity,
     convergence,
     dam_break,
@@ -22,7 +23,7 @@ from sim_engine.validation import (
     wall_tightness,
     whole_pours,
 )
-from sim_engine.validation.case_result import CaseEffort, CaseResult, Figure, Measurement, at_least, collected
+from .case_result import CaseEffort, CaseResult, Figure, Measurement, at_least, collected
 
 PLAIN = SimulationParameters(cohesion=0.0, xsph_rate=1.0, friction=0.0)
 """θ of the cases, as their references assume. Water's own viscosity has no effect in a cup, a liquid has no dry

@@ -12,9 +12,10 @@ import numpy as np
 
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquids import SimulationParameters
-from sim_engine.validation.case_result import Figure, Measurement, Series, within
-from sim_engine.validation.container_runs import block, holed_cup, run
-from sim_engine.validation.hydrostatic_cases import HEIGHT, RADIUS, VOLUME
+
+from .case_result import Figure, Measurement, Series, within
+from .container_runs import block, holed_cup, run
+from .hydrostatic_cases import HEIGHT, RADIUS, VOLUME
 
 HOLE = 0.010
 FLOOR = 0.003

@@ -30,12 +30,13 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.motion import Phase, PourMotion, Segment, turn
 from sim_engine.outcome import ParticleState
 from sim_engine.simulator import SETTLING, spacing
-from sim_engine.validation.case_result import Figure, Measurement, Series, at_most, within
-from sim_engine.validation.container_runs import Container, filled, run
 from sim_engine.vessel import profile
 from sim_engine.vessel.mesh_shape import MeshShape
 from sim_engine.vessel.shapes import ProfileShape, VesselSpec, cylinder
 from sim_engine.vessel.vessel import Vessel, build_vessel
+
+from .case_result import Figure, Measurement, Series, at_most, within
+from .container_runs import Container, filled, run
 
 Floats = NDArray[np.float64]
 

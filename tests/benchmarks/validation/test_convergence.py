@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.validation.convergence import CHOSEN, FOUND, ConvergencePour, spillage
 from sim_engine.liquids import SimulationParameters
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation.convergence import CHOSEN, FOUND, ConvergencePour, spillage
 
 HIDDEN = 0.12
 """Friction of the liquid that is calibrated on."""

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquids import SimulationParameters
-from sim_engine.validation.case_result import Figure, Measurement, Series, at_most, reported, within
-from sim_engine.validation.container_runs import block, box, run
+
+from .case_result import Figure, Measurement, Series, at_most, reported, within
+from .container_runs import block, box, run
 
 Floats = NDArray[np.float64]
 

@@ -21,9 +21,12 @@ from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation import capillarity as wetting
-from sim_engine.validation.case_result import CaseEffort, Figure, Measurement, Series, collected, reported, within
-from sim_engine.validation.container_runs import (
+from sim_engine.vessel.distance_grid import SignedDistanceGrid
+from sim_engine.vessel.shapes import cylinder
+
+from . import capillarity as wetting
+from .case_result import CaseEffort, Figure, Measurement, Series, collected, reported, within
+from .container_runs import (
     MARGIN,
     Container,
     LiquidState,
@@ -34,9 +37,7 @@ from sim_engine.validation.container_runs import (
     stir,
     symmetric,
 )
-from sim_engine.validation.whole_pours import simulated
-from sim_engine.vessel.distance_grid import SignedDistanceGrid
-from sim_engine.vessel.shapes import cylinder
+from .whole_pours import simulated
 
 Floats = NDArray[np.float64]
 AnyFloats = NDArray[np.floating]

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquids import SimulationParameters
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation.case_result import (
+
+from .case_result import (
     CaseEffort,
     Figure,
     Measurement,
@@ -29,8 +30,8 @@ from sim_engine.validation.case_result import (
     reported,
     within,
 )
-from sim_engine.validation.container_runs import DENSITY, EMPTY_SPACE, block, box, run, symmetric
-from sim_engine.validation.sloshing import fit_oscillation
+from .container_runs import DENSITY, EMPTY_SPACE, block, box, run, symmetric
+from .sloshing import fit_oscillation
 
 Floats = NDArray[np.float64]
 

@@ -17,9 +17,10 @@ from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation.case_result import Figure, Measurement, Series, at_most, reported
-from sim_engine.validation.whole_pours import simulated
 from sim_engine.vessel.shapes import ProfileShape, VesselSpec, cylinder
+
+from .case_result import Figure, Measurement, Series, at_most, reported
+from .whole_pours import simulated
 
 LIP_RADIUS = 0.04
 POURER = cylinder("beaker", inner_radius=LIP_RADIUS, inner_height=0.10)

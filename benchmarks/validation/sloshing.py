@@ -20,10 +20,11 @@ from scipy.special import jv, jvp
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquids import SimulationParameters
 from sim_engine.simulator import spacing
-from sim_engine.validation.case_result import Figure, Measurement, Series, reported, within
-from sim_engine.validation.container_runs import Container, filled, run, still_pose
-from sim_engine.validation.hydrostatic_cases import CUP, HEIGHT, RADIUS, VOLUME
 from sim_engine.vessel.vessel import build_vessel
+
+from .case_result import Figure, Measurement, Series, reported, within
+from .container_runs import Container, filled, run, still_pose
+from .hydrostatic_cases import CUP, HEIGHT, RADIUS, VOLUME
 
 Floats = NDArray[np.float64]
 
