@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import asyncio.base_events
+import inspect
 import re
 import sys
 from collections.abc import Callable, Coroutine
@@ -16,10 +17,14 @@ from typer.testing import CliRunner
 
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.cli.app import app
+from orchestrator.learning.deployment.d3 import D3Settings
 from orchestrator.records.states import State
 from orchestrator.runs.run_service import RunResources, RunService
 from orchestrator.runs.run_tasks import run_task
+from orchestrator.runs.strategy_harness import SCENE, THETA, StrategyHarness
+from tests.support.plans import deployment_plan
 from tests.support.small_campaign import CAMPAIGN, write_campaign
+from tests.support.toy_spillage import narrow_cup
 from tests.support.waiting import wait_async
 
 ROOT = Path(__file__).parents[2]
@@ -145,6 +150,43 @@ def test_a_stop_reaches_the_arm_through_the_listed_files(tmp_path: Path, monkeyp
     begin = files.index("orchestrator/runs/run_service.py")
     assert walk.ended
     assert [*walk.files] == files[begin : files.index("actors/arm/arm_device.py") + 1]
+
+
+DECISIONS = {
+    *{"Deployment.tell", "DeploymentLedger._settle", "PourTrial.take", "Hybrid._next", "PourChoice.query", "fit"},
+    *{"GaussianProcess.__init__", "ModelAveragedProcess.__init__", "Region.draw", "minimise", "looked_ahead"},
+    *{"least_loss", "PourChoice.judge", "Deployment._pour"},
+}
+
+
+def test_a_decision_of_d3_goes_through_the_listed_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = deployment_plan(model="adaptive", simulations_per_pour=1, pours=2)
+    strategy = plan.settings.build(plan, SCENE, THETA, 1)
+    with Walk(monkeypatch, DECISIONS, "no function") as walk:
+        StrategyHarness(narrow_cup).run(strategy)
+    assert set(walk.files) - {"orchestrator/runs/strategy_harness.py"} == set(listed("A decision of D3"))
+
+
+def test_the_files_of_a_particle_at_a_wall_have_what_the_page_names_and_the_step_calls_it() -> None:
+    files = listed("A particle at a wall")
+    chapter = PAGE.partition("**A particle at a wall")[2].partition("\n**")[0]
+    texts = {name: (ROOT / name).read_text(encoding="utf-8") for name in files}
+    for name in re.findall(r"\(`(\w+)`\)", chapter):
+        assert any(f"def {name}(" in text for text in texts.values()), name
+    step, density = texts["sim_engine/fluid/step.py"], texts["sim_engine/fluid/density.py"]
+    for part in ("density", "viscosity", "tension", "walls"):
+        assert f"from sim_engine.fluid.{part} import" in step
+    assert "from sim_engine.fluid.kernels import" in density
+    assert "SignedDistanceGrid" in texts["sim_engine/fluid/scene_setup.py"]
+
+
+def test_a_new_key_is_declared_where_the_page_says() -> None:
+    declared, campaign, resolution, plan = listed("A new key")
+    assert "stop" in D3Settings.model_fields
+    assert Path(declared) == Path(inspect.getfile(D3Settings)).relative_to(ROOT)
+    assert "stop" not in (ROOT / campaign).read_text(encoding="utf-8").split()  # one place
+    for name, holds in ((declared, "def check("), (resolution, "def resolve_campaign("), (plan, "class CampaignPlan")):
+        assert holds in (ROOT / name).read_text(encoding="utf-8")
 
 
 def test_each_file_of_a_stop_is_used_by_one_before_it() -> None:
