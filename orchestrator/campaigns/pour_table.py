@@ -193,11 +193,11 @@ class _PourReader:
         table.problems.extend(saved.misfits())
         alike: dict[tuple[str | float, ...], list[TableRow]] = {}
         read = [i for i, column in enumerate(columns) if column is not None and column.standard != "split"]
+        if len(saved.rows) > MOST_POURS:
+            message = f"has more than {MOST_POURS} pours, which no calibration can use; keep the best of them"
+            table.problems.append(saved.problem(saved.rows[MOST_POURS], None, "", message))
+            return
         for line in saved.rows:
-            if len(table.rows) == MOST_POURS:
-                message = f"has more than {MOST_POURS} pours, which no calibration can use; keep the best of them"
-                table.problems.append(saved.problem(line, None, "", message))
-                return
             if len(line.cells) == len(columns):
                 alike.setdefault(tuple(line.cells[i] for i in read), []).append(line)
             row = self._row(line, columns)

@@ -143,7 +143,7 @@ def test_a_table_that_nobody_weighed_is_refused_in_time(case: str, folder: Path)
     path = write(folder, "bad.yaml", RECORDED)
     with counted_calls() as calls:
         told = report(path)
-    assert calls.count < MOST_CALLS
+    assert calls.count < MOST_CALLS / 5
     assert expected in told
 
 
