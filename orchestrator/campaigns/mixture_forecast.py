@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from actors.dosing.dose_series import DoseForecast
+from actors.dosing.dose_series import DoseForecast, predict_dose
 from actors.interfaces import DoseSource, DoseTarget
-from actors.laboratory import predicted_dose
+from actors.laboratory import expected_display
 from orchestrator.learning.campaign_plan import CampaignPlan, PlannedDose
 from orchestrator.learning.dispense import FILL_DEVIATION, WEIGHED_DEVIATION, KnownSource, share_deviation
 from orchestrator.learning.mixtures import dose_strategy
@@ -79,7 +79,9 @@ class MixtureForecast:
         scene = self._series.scene(self._series.sources_of(dose)[0], dose.receiver)
         source = DoseSource(scene.pourer.name, scene.liquid.mass, FILL_DEVIATION, fill=True, constants=0)
         target = DoseTarget(dose.amount, dose.limit, dose.position, source)
-        return _predicted(pickle.dumps((self._laboratory, scene, target, seed)))
+        laboratory = self._laboratory
+        display = expected_display(laboratory.balance)
+        return _predicted(pickle.dumps((scene, target, seed, laboratory.dosing, display)))
 
     def _fillings(self, seed: int) -> Counter[str]:
         strategy, fills = dose_strategy(self._series, seed), Counter[str]()
@@ -175,10 +177,10 @@ def _predicted(asked: bytes) -> DoseForecast:
     """A prediction, made once in a process: a campaign is checked when it is submitted, and again when it begins.
 
     Args:
-        asked: pickled laboratory, scene, dose and seed.
+        asked: pickled scene, dose, seed, settings of doses and expected display.
     """
-    laboratory, scene, dose, seed = pickle.loads(asked)
-    return predicted_dose(laboratory, scene, dose, seed, PREDICTED)
+    scene, dose, seed, settings, display = pickle.loads(asked)
+    return predict_dose(scene, dose, seed, settings, PREDICTED, display)
 
 
 def _half(amount: float, predicted: DoseForecast) -> float:

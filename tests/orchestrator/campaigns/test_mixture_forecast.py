@@ -84,8 +84,8 @@ def test_later_doses_and_a_second_check_cost_no_further_predictions(
 
     mixture_forecast._predicted.cache_clear()
     calls = []
-    original = mixture_forecast.predicted_dose
-    monkeypatch.setattr(mixture_forecast, "predicted_dose", lambda *a: calls.append(a) or original(*a))
+    original = mixture_forecast.predict_dose
+    monkeypatch.setattr(mixture_forecast, "predict_dose", lambda *a: calls.append(a) or original(*a))
     said: list[str] = []
     MixtureForecast(load_campaign(path), said.append)
     assert said[0] == "predicting the doses of the mixtures, 1 of 4: 20 g of ethanol"
