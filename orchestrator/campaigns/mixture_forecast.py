@@ -79,9 +79,8 @@ class MixtureForecast:
         scene = self._series.scene(self._series.sources_of(dose)[0], dose.receiver)
         source = DoseSource(scene.pourer.name, scene.liquid.mass, FILL_DEVIATION, fill=True, constants=0)
         target = DoseTarget(dose.amount, dose.limit, dose.position, source)
-        laboratory = self._laboratory
-        display = expected_display(laboratory.balance)
-        return _predicted(pickle.dumps((scene, target, seed, laboratory.dosing, display)))
+        display = expected_display(self._laboratory.balance)
+        return _predicted(pickle.dumps((scene, target, seed, self._laboratory.dosing, PREDICTED, display)))
 
     def _fillings(self, seed: int) -> Counter[str]:
         strategy, fills = dose_strategy(self._series, seed), Counter[str]()
@@ -177,10 +176,9 @@ def _predicted(asked: bytes) -> DoseForecast:
     """A prediction, made once in a process: a campaign is checked when it is submitted, and again when it begins.
 
     Args:
-        asked: pickled scene, dose, seed, settings of doses and expected display.
+        asked: pickled arguments of `predict_dose`.
     """
-    scene, dose, seed, settings, display = pickle.loads(asked)
-    return predict_dose(scene, dose, seed, settings, PREDICTED, display)
+    return predict_dose(*pickle.loads(asked))
 
 
 def _half(amount: float, predicted: DoseForecast) -> float:

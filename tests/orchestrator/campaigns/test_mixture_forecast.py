@@ -82,7 +82,7 @@ def test_later_doses_and_a_second_check_cost_no_further_predictions(
     path.write_text(CAMPAIGN.replace("outputs", rows + "outputs"), encoding="utf-8")
     from orchestrator.campaigns import mixture_forecast
 
-    mixture_forecast._predicted.cache_clear()
+    monkeypatch.setattr(mixture_forecast, "PREDICTED", 2)  # predictions that no other test makes
     calls = []
     original = mixture_forecast.predict_dose
     monkeypatch.setattr(mixture_forecast, "predict_dose", lambda *a: calls.append(a) or original(*a))
@@ -98,8 +98,11 @@ def test_later_doses_and_a_second_check_cost_no_further_predictions(
 RACK = Path(__file__).parents[3] / "configs" / "laboratories" / "rack.yaml"
 
 
-def test_vessels_places_and_amounts_that_are_impossible_are_refused_at_once(tmp_path: Path) -> None:
+def test_vessels_places_and_amounts_that_are_impossible_are_refused_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The cup has no empty mass, both sources are too heavy when full, and the balance does not support one amount."""
+    monkeypatch.setattr("orchestrator.campaigns.mixture_forecast.PREDICTED", 2)
     text = CAMPAIGN.replace(
         "{name: bench, mode: virtual, bench: {liquid: {particles: 400}, operator_time: 60 s}}", str(RACK)
     )
