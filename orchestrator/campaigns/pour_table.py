@@ -325,6 +325,8 @@ def _keep_for_testing(table: RecordTable, holdout: int | None) -> str:
     kept = max(1, count // 8) if holdout is None else holdout
     if kept >= count:
         text = f"keeps {kept} of {count} pours for testing, so that none is left to fit; change 'holdout'"
+        if not count:
+            text = "has a header and no pour below it; write one line for each pour"
         table.problems.append(Problem(table.path, 1, 1, "", text))
         return ""
     chosen = sorted({(2 * k + 1) * count // (2 * kept) for k in range(kept)})

@@ -466,9 +466,9 @@ def _written_mesh(
     trimesh.Trimesh(1e3 * vertices, faces, process=False).export(path)
     try:
         built = build_vessel(VesselSpec(name=name, shape=MeshShape(path=path, unit="mm", up=up)))
-    except VesselError:
+    except VesselError as error:
         path.unlink()
-        raise
+        raise VesselError(str(error).replace(path.name, given.name)) from None
     doubts = list(doubts)
     if (tilt := math.degrees(rim_tilt(built))) > LEVEL:
         doubts.append(

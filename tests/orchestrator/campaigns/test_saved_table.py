@@ -467,6 +467,8 @@ def test_a_table_without_splits_keeps_pours_for_testing_and_names_them(tmp_path:
     assert "none is left to fit" in str(problem)
     (problem,) = read(tmp_path, PLAIN, holdout=1).problems
     assert "has a column 'split'" in str(problem)
+    (problem,) = read(tmp_path, NOTEBOOK.splitlines()[0] + "\n", holdout=2).problems
+    assert "has a header and no pour below it" in str(problem)
 
 
 def test_a_misspelt_column_is_no_remark(tmp_path: Path) -> None:

@@ -223,6 +223,12 @@ def test_what_makes_no_vessel_is_refused_and_nothing_is_written(tmp_path: Path, 
     assert not (tmp_path / "cup.stl").exists()
 
 
+def test_a_mesh_that_holds_nothing_is_named_by_its_own_file(tmp_path: Path) -> None:
+    trimesh.creation.cylinder(radius=30, height=80).export(tmp_path / "scan.stl")
+    with pytest.raises(DecantError, match=r"^scan.stl: no cavity"):
+        made(tmp_path, {"mesh": tmp_path / "scan.stl", "unit": "mm"})
+
+
 def test_no_file_is_written_over(tmp_path: Path) -> None:
     (tmp_path / "cup.yaml").write_text("name: cup\n")
     with pytest.raises(DecantError, match="exists already"):
