@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from actors.balance.display_behaviour import DisplayBehaviour, DisplayModel
 from actors.balance.scale_model import SETTLED, EmulatedScale, Load, ScaleSettings
-from actors.balance.step_response import step_response
+from actors.balance.step_response import FILTERS, step_response
 from tests.support.hypothesis_examples import examples
 
 
@@ -112,3 +112,10 @@ def test_a_known_share_of_repeats_widens_the_error_of_a_rise_without_any():
     assert plain.repeats == 0.0
     assert wide.error > 2.0 * plain.error
     assert step_response(times, masses, resolution=1e-4).lag == plain.lag
+
+
+def test_the_response_of_a_filter_is_read_from_its_table_without_a_visible_error() -> None:
+    times = np.concatenate([[-1.0, 0.0, 50.0, 80.0], np.random.default_rng(3).uniform(0.0, 50.0, 5_000)])
+    exact = 1.0 - np.exp(-np.clip(times, 0.0, 50.0))
+    # linear interpolation in steps of h is off by h²/8 times the curvature, here at most 1
+    assert np.abs(FILTERS["first order"][1](times) - exact).max() < 1e-3**2 / 8
