@@ -116,9 +116,14 @@ class JsonModel(BaseModel):
 
 
 class RequestModel(JsonModel):
-    """Base of the models of requests: an unknown key is an error."""
+    """Base of the models of requests: an unknown key is an error, and a key with null counts as left out."""
 
     model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_nulls(cls, data: Any) -> Any:
+        return {key: value for key, value in data.items() if value is not None} if isinstance(data, dict) else data
 
 
 class PourIn(RequestModel):

@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
+from orchestrator.daemon.rigs.pour_request import PourIn, SubmissionIn
 from orchestrator.daemon.rigs.submissions import (
     Submission,
     SubmissionError,
@@ -95,3 +97,11 @@ def test_a_daemon_without_rigs_says_that_the_laboratory_is_missing(tmp_path: Pat
     text, files = pack_unresolved(without_laboratory(tmp_path))
     with pytest.raises(SubmissionError, match=r"campaign\.yaml:.*'laboratory' is missing"):
         receive(settings, Submission(text=text, files=files), "00000a", "somebody")
+
+
+def test_a_null_in_a_request_is_a_key_that_is_left_out() -> None:
+    """Clients of typed languages write null for an id that there is not."""
+    request = SubmissionIn.model_validate({"text": "name: x", "id": None, "rig": None, "after": None})
+    assert (request.id, request.rig) == ("", "")
+    with pytest.raises(ValidationError, match="Field required"):
+        PourIn.model_validate({"id": None, "source": "jug", "receiver": "cup", "amount": "20 g"})
