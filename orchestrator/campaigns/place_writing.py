@@ -111,6 +111,8 @@ def labware_rack(path: Path) -> tuple[RackSettings, float]:
         tips = bool(labware.get("parameters", {}).get("isTiprack"))
         if not all(map(math.isfinite, chain.from_iterable(cells.values()))):
             raise ValueError("a length is no number")
+        if not all(depth > 0.0 for *_, depth in cells.values()):
+            raise ValueError("a depth is not more than 0")
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise DecantError(
             f"{path}: should be a labware definition of Opentrons with 'schemaVersion', 'metadata' and 'wells', each "

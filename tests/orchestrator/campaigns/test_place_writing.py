@@ -145,6 +145,7 @@ def test_public_racks_are_read(name: str, tmp_path: Path) -> None:
         (_apart(1.0, depth=600.0), "'six tubes' approach: "),
         (_well("A2", x=float("nan")), "a length is no number"),
         (_apart(1.0, depth=float("inf")), "a length is no number"),
+        (_well("A2", depth=-43.9), "a depth is not more than 0"),
         ({**tubes(), "parameters": None}, "should be a labware definition of Opentrons"),
         ([tubes()], "should be a labware definition of Opentrons"),
     ],
