@@ -230,8 +230,11 @@ class TcpEnd(LineEnd):
 SHORTEST_WAIT = 0.001
 """Shortest wait of the server [s]."""
 
-_PARENT_CHECK = 1.0
-"""Interval of the check whether the parent is alive [s]."""
+_LONGEST_WAIT = 0.05
+"""Longest wait of the server, in which it also checks whether its parent is alive [s]."""
+
+_LATEST = 0.05
+"""Time after a wait within which the server acts [s]: a clock that it shares waits for a late one."""
 
 
 class Server:
@@ -250,11 +253,18 @@ class Server:
 
     def run(self) -> None:
         """Run until the parent ends or closes its end."""
+        try:
+            self._serve()
+        finally:
+            self._clock.withdraw("balance")
+
+    def _serve(self) -> None:
         wake: float | None = None
         while os.getppid() == self._parent:
             now = self._clock.now
             # a shared clock advances in steps, or stands
-            timeout = _PARENT_CHECK if wake is None else min(max(wake - now, SHORTEST_WAIT), _PARENT_CHECK)
+            timeout = _LONGEST_WAIT if wake is None else min(max(wake - now, SHORTEST_WAIT), _LONGEST_WAIT)
+            self._clock.promise("balance", timeout + _LATEST)
             watched = [0] if self._line.descriptor is None else [0, self._line.descriptor]
             ready, _, _ = select.select(watched, [], [], timeout)
             now = self._clock.now

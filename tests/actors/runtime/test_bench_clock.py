@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -11,9 +13,11 @@ from pathlib import Path
 import pytest
 
 from actors.bench.virtual_bench import CREEP, standing
+from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.runtime import bench_clock
 from actors.runtime.bench_clock import DeviceClock, SharedClock, device_clock
 from actors.runtime.child_process import child_environment
+from tests.support.waiting import wait_for
 
 
 @pytest.fixture
@@ -50,6 +54,23 @@ def test_it_waits_for_no_program_that_has_ended(file: Path) -> None:
     controller = SharedClock(file)
     assert not controller.may_pass(0.008)
     assert controller.may_pass(0.008)
+
+
+def test_it_waits_for_an_emulated_balance_that_the_host_delays(file: Path) -> None:
+    """On a busy machine its readings came too late for the driver's limits, which this clock measures."""
+    controller = SharedClock(file)
+    balance = VirtualSerialBalance.start(clock=str(file))
+    try:
+        wait_for(lambda: not controller.may_pass(1e6), "the balance acts")
+        os.kill(balance.pid, signal.SIGSTOP)
+        while controller.may_pass(0.002):
+            controller.advance(0.002)
+        assert not controller.may_pass(0.002)
+        os.kill(balance.pid, signal.SIGCONT)
+        wait_for(lambda: controller.may_pass(0.002), "the balance acts again")
+    finally:
+        balance.close()
+    assert controller.may_pass(1e6)
 
 
 def test_it_goes_on_without_its_controller_and_without_a_program_that_hangs(
