@@ -19,7 +19,7 @@ from tests.support.cli_inputs import ROOT, command_tree, invoke, write_inputs
 
 HELP = {
     "": ["decant run configs/campaigns/quickstart.yaml", "2 bad input", "130 interrupted"],
-    "run": ["decant run my.yaml --resume", "Ctrl-C pauses", "runs/ID"],
+    "run": ["decant run my.yaml --resume", "Ctrl-C pauses", "outputs.directory"],
     "calibrate": ["decant calibrate configs/campaigns/recorded.yaml --json", "theta.json", "N/m"],
     "plan": ["--receiver vase.yaml", "deg/s, mm and s", "Nothing is poured"],
     "simulate": [
