@@ -33,7 +33,7 @@ from orchestrator.learning.requests import Pour
 from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.live_server import LiveView
 from orchestrator.live_view.rerun_subscriber import RerunMonitor, recorder_of
-from orchestrator.records.events import CampaignStateChanged, Event, LogLine, RequestFinished
+from orchestrator.records.events import CampaignStateChanged, Event, LogLine, RequestFinished, RequestStarted
 from orchestrator.records.journal_file import MB, JournalError, free_space
 from orchestrator.records.run_clock import run_time
 from orchestrator.records.run_record import CampaignResult
@@ -85,6 +85,8 @@ class SharedServices:
         self.notification_counts: dict[str, Counts] = {}
         self.pours = Pours()
         self.counted: Counter[tuple[str, str, str]] = Counter()
+        self._begun: dict[str, str] = {}
+        self._asked: set[str] = set()
         self.stopping = self.suspect = False
         self.rested = asyncio.Event()
         self.began = time.time()
@@ -135,11 +137,21 @@ class SharedServices:
         def receive(event: Event) -> None:
             if isinstance(event, LogLine) and event.about == "fault":
                 self.counted["faults", rig, "fault"] += 1
-            if isinstance(event, RequestFinished) and isinstance(event.request, Pour) and not event.replayed:
-                kind = "pours" if event.request.dose is None else "doses"
-                self.counted[kind, rig, outcome_of(event.request, event.outcome)] += 1
+            if not isinstance(event, RequestStarted | RequestFinished) or not isinstance(event.request, Pour):
+                return
+            kind = self._begun[rig] = "pours" if event.request.dose is None else "doses"
+            if isinstance(event, RequestFinished) and not event.replayed:
+                outcome = outcome_of(event.request, event.outcome)
+                counted = outcome == "unknown" and rig in self._asked
+                self.counted[kind, rig, outcome] += not counted
+                self._asked.discard(rig)
 
         return receive
+
+    def count_unknown(self, rig: str) -> None:
+        """Count a rig's pour or dose that a person is asked about; not again if the answer leaves it unknown."""
+        self.counted[self._begun.get(rig, "pours"), rig, "unknown"] += 1
+        self._asked.add(rig)
 
     def wake(self) -> None:
         """Wake all rig workers after a change."""
@@ -610,7 +622,7 @@ class RigWorker:
         ended, run = time.time() if state in ENDED else None, running.item.run
         verdict = None if run is None else await asyncio.to_thread(verdict_at, self._shared.settings.runs / run)
         if state == "unknown":
-            self._shared.counted["pours", self.rig.name, "unknown"] += 1
+            self._shared.count_unknown(self.rig.name)
         word = state if verdict is None or ended is None else verdict["word"]
         self._shared.counted["campaigns_ended", self.rig.name, word] += 1
         store.change(key, state=state, reason=reason, desired_state=str(desired), ended=ended, verdict=verdict)

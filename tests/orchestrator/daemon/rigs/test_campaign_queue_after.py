@@ -6,8 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.daemon.state.access_tokens import Role
+from tests.orchestrator.daemon.rigs.test_campaign_queue_doses import held_dose
+from tests.orchestrator.reports.test_mixture_report import MIXTURES
 from tests.support.small_campaign import write_campaign
 from tests.support.toy_daemon import CAMPAIGN, HeldLaboratory, Served, held, run, serving
+from tests.support.waiting import wait_async
 
 SINGLE = (
     CAMPAIGN[: CAMPAIGN.index("motion:")]
@@ -125,5 +128,30 @@ def test_a_pour_that_an_emergency_stop_ends_is_counted_as_unknown(tmp_path: Path
             after = await metrics(served)
             assert after['decant_pours_total{outcome="unknown",rig="virtual"}'] == 1.0
             assert after['decant_campaigns_ended_total{outcome="unknown",rig="virtual"}'] == 1.0
+
+    run(work())
+
+
+def test_a_dose_that_remains_unknown_after_its_question_is_counted_once(tmp_path: Path) -> None:
+    write_campaign(tmp_path, MIXTURES)
+
+    async def work() -> None:
+        async with serving(tmp_path, held_dose) as served:
+            key = await served.submit()
+            await served.pouring()
+            for _ in range(2):
+                await served.post(f"/campaigns/{key}/abort")
+            await served.until(key, "unknown")
+            counted = 'decant_doses_total{outcome="unknown",rig="virtual"}'
+            assert (await metrics(served))[counted] == 1.0
+            await served.post(f"/campaigns/{key}/resume")
+            question = await served.question()
+            await served.post(f"/questions/{question['id']}/answer", {"answer": "lost"})
+            await wait_async(lambda: len(served.laboratories) == 2, "the laboratory of the resumed run")
+            (await served.pouring()).bench.go.set()
+            await served.until(key, "finished")
+            after = await metrics(served)
+            assert after[counted] == 1.0
+            assert after['decant_pours_total{outcome="unknown",rig="virtual"}'] == 0.0
 
     run(work())
