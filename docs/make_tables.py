@@ -566,7 +566,6 @@ def _covered_later(measured: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
 
 
 GAPS = {
-    "none, before": "none, before the tilt was bounded",
     "none": "none",
     "readings": "readings",
     "commands": "commands",
