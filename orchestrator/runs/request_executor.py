@@ -430,14 +430,21 @@ class RequestExecutor:
         """Restart a virtual bench, if a pour can be made again after this error.
 
         Returns:
-            Whether it can: nothing was poured, or the plan repeats pours whose outcome is unknown.
+            Whether it can: nothing was poured, or the plan repeats pours whose outcome is unknown, and the bench has
+            started again.
         """
         laboratory = self._laboratory
         repeatable = error.nothing_poured or (error.unknown and self._repeats)
-        if not repeatable or self.bench.mode != "virtual" or not isinstance(laboratory, Restartable):
+        if not repeatable or not isinstance(laboratory, Restartable):
             return False
-        async with self._real:
-            await laboratory.restart_bench()
+        try:
+            if self.bench.mode != "virtual":
+                return False
+            async with self._real:
+                await laboratory.restart_bench()
+        except LaboratoryError:  # its machine is lost, say: the error that led here says what to do
+            _raise_if_cancelled()
+            return False
         return True
 
     async def ask(self, request: Ask) -> Outcome:

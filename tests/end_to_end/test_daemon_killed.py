@@ -147,7 +147,7 @@ def test_killed_during_a_pour_it_asks_what_came_of_it_writes_the_answer_down_and
     assert question["kind"] == "unknown"
     assert "had begun when the run was interrupted" in question["text"]
     assert question["options"] == ["repeat", "lost", "weighed SPILLED RETAINED [LOADED]"]
-    assert "bench" in question["details"]
+    assert "bench" in question["details"]["diagnostics"]
     assert laboratory.told("queue", "list", key)["state"] == "waiting for operator"
 
     nonsense = laboratory.decant("queue", "answer", str(question["id"]), "spilt", "milk", check=False)
@@ -192,7 +192,8 @@ def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_see
         laboratory.start()
         card = page.locator(".question")
         card.get_by_role("heading", name="had begun when the run was interrupted").wait_for()
-        assert card.get_by_text("simulated: it has no arm").is_visible()
+        card.get_by_text("What arm and balance show now").click()
+        card.get_by_text("simulated: it has no arm").wait_for()
         assert page.get_by_text("No connection to the daemon").is_hidden()
         card.get_by_label("Spilled").fill("3,2")
         card.get_by_label("Left in the pourer").fill("0.4")

@@ -313,11 +313,13 @@ class OutOfReachError(Exception):
 
     Attributes:
         poses: (T, 7) of the pourer in the world.
+        nominal: joints of an arm with nominal lengths (T, 6) [rad], which reaches them all; the lengths of this arm
+            give no joints near a singularity. None if that one cannot reach them either.
     """
 
-    def __init__(self, poses: FloatArray) -> None:
+    def __init__(self, poses: FloatArray, nominal: FloatArray | None = None) -> None:
         super().__init__("out of reach")
-        self.poses = poses
+        self.poses, self.nominal = poses, nominal
 
 
 def follow(poses: FloatArray, near: FloatArray, spec: UrArmSettings) -> FloatArray:
@@ -337,10 +339,10 @@ def follow(poses: FloatArray, near: FloatArray, spec: UrArmSettings) -> FloatArr
     model = spec.robot
     flange = flange_poses(poses, spec)
     number = posture(np.array(spec.home.angles), model)
-    joints = inverse(flange.rotation, flange.position, model.nominal)[:, number]
-    joints = refined(joints, flange.rotation, flange.position, model)
+    nominal = inverse(flange.rotation, flange.position, model.nominal)[:, number]
+    joints = refined(nominal, flange.rotation, flange.position, model)
     if np.isnan(joints).any():
-        raise OutOfReachError(poses)
+        raise OutOfReachError(poses, None if np.isnan(nominal).any() else nominal)
     return np.unwrap(np.concatenate([near[None], joints]), axis=0)[1:]
 
 
@@ -411,7 +413,14 @@ def _line(
     hardest: float,
 ) -> tuple[FloatArray, FloatArray]:
     s = np.linspace(0.0, 1.0, max(math.ceil(distance / 0.005), math.ceil(angle / math.radians(1.0)), 8) + 1)
-    joints = follow(_between(a, b, s), near, spec)
+    heading = math.remainder(2.0 * math.atan2(a[6], a[3]), 2.0 * math.pi)
+    try:
+        joints = follow(_between(a, b, s), near, spec)
+    except OutOfReachError as error:
+        if error.nominal is None:
+            raise
+        racing = np.abs(np.diff(np.unwrap(error.nominal, axis=0), axis=0)).max(axis=0)
+        raise RacingJointError(int(np.argmax(racing)), heading, angle, math.inf) from None
     rates = np.abs(np.diff(joints, axis=0)).max(axis=0) * (len(s) - 1)
     first = rates.max()
     second = np.abs(np.diff(joints, n=2, axis=0)).max() * (len(s) - 1) ** 2
@@ -426,8 +435,7 @@ def _line(
         0.5 * spec.limits.tilt_speed / max(angle, 1e-9),
     )
     if first > MOST_TURNS * 2.0 * math.pi and 1.0 / speed > LONGEST:
-        heading = 2.0 * math.atan2(a[6], a[3])
-        raise RacingJointError(int(np.argmax(rates)), math.remainder(heading, 2.0 * math.pi), angle, 1.0 / speed)
+        raise RacingJointError(int(np.argmax(rates)), heading, angle, 1.0 / speed)
     times, fraction = trapezoid(1.0, 0.98 * speed, min(hardest / way, half / max(first, 1e-9)), STEP)
     return times, follow(_between(a, b, fraction), near, spec)
 

@@ -200,7 +200,7 @@ def test_a_receiver_turned_away_from_home_is_refused_soon_and_in_words_of_the_be
     doing: list[str] = []
     with counted_calls() as calls:
         first, second = check_campaign(turned, doing=doing.append)
-    assert calls.count < 1_000_000
+    assert calls.count < 4_000_000  # the lengths of the run's own arm need a refined inverse kinematics
     for problem in (first, second):
         assert "home holds the pourer as for a direction of 90 deg, and cell.direction is 0 deg" in problem.message
         assert "the full pourer would be turned by 90 deg" in problem.message

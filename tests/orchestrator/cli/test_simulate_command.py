@@ -124,7 +124,7 @@ def test_a_cup_whose_shape_may_be_off_has_a_wider_band(inputs: Path) -> None:
         done = typed(f"{SIMULATE.replace('70', '120')} --seed 6 --seeds 4 --receiver {name}.yaml", inputs)
         printed[name] = done.stdout
     low, high = ([float(end) for end in _BAND.findall(text)[0]] for text in printed.values())
-    assert high[1] - high[0] > 1.5 * (low[1] - low[0])
+    assert high[1] - high[0] > low[1] - low[0] + 5.0  # both end at 100 %, uncalibrated as they are
     assert "shapes that the vessels may have" in printed["off"]
     assert "shapes" not in printed["known"]
 

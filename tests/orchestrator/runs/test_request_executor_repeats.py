@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.interfaces import LinkLostError, UnknownPourError
+from actors.interfaces import BenchLostError, LinkLostError, UnknownPourError
 from orchestrator.learning.requests import Poured
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.request_executor import (
@@ -69,6 +69,18 @@ def test_an_unknown_pour_is_repeated_without_ending_the_run_if_the_campaign_says
     assert [type(outcome) for _, outcome in script.told] == [Poured]
     assert laboratory.restarts == 1
     assert len(notes(tmp_path)) == 1
+
+
+def test_a_bench_that_cannot_be_restarted_leaves_the_error_that_says_what_to_do(tmp_path: Path) -> None:
+    @dataclass
+    class Gone(RestartableLaboratory):
+        async def restart_bench(self) -> None:
+            raise BenchLostError("the bench's machine is lost")
+
+    laboratory = Gone(bench=failing(LOST).bench)
+    with pytest.raises(PourNotMadeError, match="connection to the controller was lost") as ended:
+        run(tmp_path, laboratory, plan=toy_plan(tmp_path), stages=one_stage(Script(pour(1))))
+    assert ended.value.exit_code == 3
 
 
 def test_an_unknown_pour_is_a_person_s_to_tell_otherwise(tmp_path: Path) -> None:
