@@ -199,7 +199,7 @@ def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_see
         card.get_by_label("Left in the pourer").fill("0.4")
         card.get_by_role("button", name="It was weighed").click()
         card.wait_for(state="detached")
-        page.locator("#ended li").get_by_text("finished").wait_for()
+        page.locator("#ended li").get_by_text("complete").wait_for()
         assert laboratory.told("queue", "list", key)["state"] == "finished"
         assert laboratory.end() == 0
 
