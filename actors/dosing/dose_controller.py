@@ -320,7 +320,7 @@ class DoseController:
         self._begin: float | None = None
         self._zero: float | None = None
         self._recent: list[DoseReading] = []
-        self._doubted: float | None = None  # net mass of the last reading, if it was implausible [kg]
+        self._implausible: float | None = None  # net mass of the last reading, if it was implausible [kg]
         self._now, self._tilt, self._command = 0.0, 0.0, TiltCommand(0.0, 0.0)
         self._rising = 0
         self._innovations: list[float] = []
@@ -791,15 +791,15 @@ class DoseController:
         if abs(net.mass - expected) > gate:
             self._doubt_since = self._doubt_since if self._doubt_since is not None else reading.time
             most, least = OTHER_NUMBER * expected + FAR_OFF, expected / OTHER_NUMBER - FAR_OFF
-            confirmed = self._doubted is not None and abs(net.mass - self._doubted) <= gate
-            self._doubted = net.mass
+            confirmed = self._implausible is not None and abs(net.mass - self._implausible) <= gate
+            self._implausible = net.mass
             if self.phase is DosePhase.SETTLE and not confirmed:  # by the one before: a single one is not weighed
                 del self._recent[-1]
                 return
             if self.phase is not DosePhase.SETTLE or not least < net.mass < most:
                 return
         else:
-            self._doubt_since = self._doubted = None
+            self._doubt_since = self._implausible = None
         before = self._recent[-2].mass - self._zero if len(self._recent) > 1 else 0.0
         rises = net.mass > before + 0.5 * self._step_size and net.mass > self._threshold
         self._rising = self._rising + 1 if rises else 0

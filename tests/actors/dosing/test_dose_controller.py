@@ -327,10 +327,13 @@ def test_a_balance_that_sends_seldom_and_is_lost_ends_the_dose_below_its_amount(
     assert record.stopped - record.readings[-1].time < 2.5 + 0.6
 
 
-def test_a_dose_continues_after_a_short_silence_of_the_balance() -> None:
+def test_a_dose_continues_after_a_short_silence_of_the_balance(monkeypatch: pytest.MonkeyPatch) -> None:
+    loosened, loosen = [], DoseEstimator.loosen
+    monkeypatch.setattr(DoseEstimator, "loosen", lambda self: (loosened.append(self), loosen(self)))
     bench, controller = known_display(0.1)
     record, result = bench.dose(Unheard(controller, 2.0)), controller.result
     assert result is not None
+    assert loosened, "what was believed of the flow is doubtful after a silence"
     assert result.end is DoseEnd.REACHED
     assert record.received == pytest.approx(0.1, abs=2e-3)
 
