@@ -379,10 +379,9 @@ def given_theta(theta: SimulationParameters | Run | Path | str | None, campaign:
     if calibrated is None or recommended is None:
         raise InvalidArgumentError(f"theta: run {theta.directory} has found no θ*; give one that has calibrated")
     scores = evaluation_of(theta.results)
-    needed = campaign.deployment is not None and campaign.deployment.settings.needs_posterior
     return GivenTheta(
         recommended,
-        posterior_draws(calibrated, POSTERIOR_DRAWS) if needed or recommended == calibrated.theta else (),
+        posterior_draws(calibrated, POSTERIOR_DRAWS) if recommended == calibrated.theta else (),
         None if scores is None else calibration_residual(theta.campaign.calibration, scores, len(calibrated.searched)),
     )
 

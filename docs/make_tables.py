@@ -45,7 +45,6 @@ from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
 from orchestrator.daemon.state import daemon_settings as daemon
 from orchestrator.daemon.state.notifications import NotifySettings
 from orchestrator.learning.campaign_plan import OutputSettings
-from orchestrator.learning.deployment.disturbances import RiskSettings
 from orchestrator.learning.deployment.model_monitoring import (
     RiskLimitSettings,
     StopSettings,
@@ -73,7 +72,6 @@ SECTIONS: dict[str, type[Settings]] = {
     "pours": campaign.PoursSettings,
     "transfer": campaign.TransferSettings,
     "deployment": campaign.DeploymentSection,
-    "risk": RiskSettings,
     "risk_limit": RiskLimitSettings,
     "stop": StopSettings,
     "data": campaign.DataSettings,
@@ -167,7 +165,6 @@ OF_SECTIONS = {
     "Loss": "[loss](#loss)",
     "Objective": "[objective](#objectives)",
     **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
-    "RiskSettings": "[risk](#risk)",
     "RiskLimitSettings": "[risk limit](#risk-limit)",
     "StopSettings": "[stop](#stop)",
     "DataSettings": "[data](#data)",
@@ -408,7 +405,6 @@ MEASURED = (
         "study-intervals",
         "learning",
         "budgets",
-        "risk",
         "optimizers",
         "viscosity",
         "dribbling",

@@ -1,7 +1,7 @@
 """Questions to the optimiser and its answers: plain values that are sent between processes, journalled and replayed.
 
 `SuggestionQuery` is a question, with one type for each kind, and `Suggestion` its answer. `ModelDiscrepancy` and
-`DiscrepancyFound` describe how a bench may differ from its simulator, `Risk` the disturbances of execution,
+`DiscrepancyFound` describe how a bench may differ from its simulator,
 `PosteriorQuestion` and `DesignQuestion` the calibration by weighed pours.
 """
 
@@ -291,46 +291,6 @@ class Posterior:
 
 
 @dataclass(frozen=True)
-class Disturbance:
-    """One disturbance of execution: x becomes scales · x + shifts, extended by coordinates that requests do not have.
-
-    Attributes:
-        scales, shifts: one number for each axis of the space.
-        context: errors of execution that do not change an axis.
-    """
-
-    scales: Point
-    shifts: Point
-    context: Point = ()
-
-
-@dataclass(frozen=True)
-class Risk:
-    """The risk measure over disturbances: the mean, or the CVaR, which is the mean of the worst fraction 1 − level.
-
-    Attributes:
-        disturbances: equally likely.
-        level: β of CVaR, 0 ≤ β < 1; 0: the mean of all.
-    """
-
-    disturbances: tuple[Disturbance, ...]
-    level: float = 0.0
-
-
-@dataclass(frozen=True)
-class RiskAnswer:
-    """Results over the disturbances, at each of `SurrogateQuery.predict_at`.
-
-    Attributes:
-        expected: means over the disturbances.
-        spreads: standard deviations over them.
-    """
-
-    expected: tuple[float, ...]
-    spreads: tuple[float, ...]
-
-
-@dataclass(frozen=True)
 class Equality:
     """When a recommended point is equal to others, so that the gentlest of them is taken.
 
@@ -457,28 +417,6 @@ class MinimumQuery(ProposalQuery):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RiskQuery(ProposalQuery):
-    """Minimise the mean or the CVaR of a cost over disturbances of the request.
-
-    The observations are of requests as executed: points of `data` have `space.dimension` coordinates (which may leave
-    the cube) followed by the disturbances' context. The minimised, predicted and mapped quantity is the measure over
-    the disturbances of a request. `predict_at` names the requests that the best point is chosen from.
-
-    Attributes:
-        risk: the disturbances and the measure.
-        acquisition: see `AcquisitionName`.
-    """
-
-    risk: Risk
-    acquisition: AcquisitionName = "lcb"
-
-    @property
-    def context_dimension(self) -> int:
-        """See `SurrogateQuery.context_dimension`."""
-        return len(self.risk.disturbances[0].context) if self.risk.disturbances else 0
-
-
-@dataclass(frozen=True, kw_only=True)
 class CalibrationQuery(ProposalQuery):
     """Minimise the mean absolute value of signed differences over contexts that are not searched.
 
@@ -519,7 +457,7 @@ class PourQuery(ProposalQuery):
     discrepancy: ModelDiscrepancy | None = None
 
 
-SuggestionQuery = SpaceFillingQuery | RegressionQuery | MinimumQuery | RiskQuery | CalibrationQuery | PourQuery
+SuggestionQuery = SpaceFillingQuery | RegressionQuery | MinimumQuery | CalibrationQuery | PourQuery
 """A question to the optimiser; journals tag it with the name of its type."""
 
 
@@ -563,8 +501,7 @@ class Suggestion:
         deviations: posterior standard deviations of the noise-free cost there.
         best_point: minimiser of the posterior mean over the observed points (the simulated ones if there are no
             others), except those that were refused or probably are. After failures, the minimised quantity is the
-            expectation with a failure of the estimated probability, at the largest observed cost. With a risk: the
-            minimiser over `predict_at`, because requests differ from the observed points. With
+            expectation with a failure of the estimated probability, at the largest observed cost. With
             `SurrogateQuery.equality`: the gentlest of equal points. None without a surrogate.
         best_mean: posterior mean there.
         best_deviation: its standard deviation.
@@ -582,7 +519,6 @@ class Suggestion:
             failure.
         posterior: answer to `CalibrationQuery.posterior`; None without a surrogate.
         best_noise: standard deviation of a single real observation at `best_point`; None without a surrogate.
-        risk: with a risk: further results at `SurrogateQuery.predict_at`.
         gains: with a `DesignQuestion`: expected reduction of the variance of predictions by weighing a pour at each
             candidate, averaged over the targets; in the cost's unit, squared.
         uncertainty: with a `DesignQuestion`: the current variance, averaged over the targets.
@@ -607,7 +543,6 @@ class Suggestion:
     feasibilities: tuple[float, ...] = ()
     posterior: Posterior | None = None
     best_noise: float | None = None
-    risk: RiskAnswer | None = None
     gains: tuple[float, ...] = ()
     uncertainty: float | None = None
     discrepancy: DiscrepancyFound | None = None

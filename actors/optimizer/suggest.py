@@ -32,7 +32,6 @@ from actors.optimizer.questions import (
     PosteriorQuestion,
     PourQuery,
     ProposalQuery,
-    RiskQuery,
     SpaceFillingQuery,
     Suggestion,
     SuggestionQuery,
@@ -40,7 +39,6 @@ from actors.optimizer.questions import (
     SurrogateQuery,
     found_good,
 )
-from actors.optimizer.risk_measures import RiskProcess
 from actors.optimizer.surrogate_models import Model, QueryArrays, array, fit, tuples
 from actors.optimizer.theta_posterior import (
     DISCREPANCY_PRIOR,
@@ -61,24 +59,22 @@ def describe(
     query: SurrogateQuery, arrays: QueryArrays, model: Model, points: Array, feasibility: Feasibility | None
 ) -> dict[str, object]:
     """Return the surrogate's results about the proposals, the observations and further points."""
-    risky, other_space = isinstance(query, RiskQuery), isinstance(query, RiskQuery | CalibrationQuery)
+    other_space = isinstance(query, CalibrationQuery)
     known = arrays.known if len(arrays.known) else arrays.simulated
-    if risky:
-        known = arrays.region.snap(array(query.predict_at, query.space.dimension))
-    elif feasibility is not None:
+    if feasibility is not None:
         known = known[feasibility.likely(known)]
-    if not risky and (allowed := arrays.region.allows(known)).any():
+    if (allowed := arrays.region.allows(known)).any():
         known = known[allowed]  # prior data may lie outside the current constraints
     means, deviations = model.surrogate.predict(points) if len(points) else (np.empty(0), np.empty(0))
     at_known, known_deviations = model.surrogate.predict(known)
     expected = at_known
-    if not risky and feasibility is not None and len(arrays.costs):
+    if feasibility is not None and len(arrays.costs):
         # E = P m(x) + (1 − P) · (largest observed cost), P that the pour does not fail
         probability = feasibility.made(known)
         expected = probability * at_known + (1.0 - probability) * arrays.costs.max()
     best = int(np.argmin(expected))
     description: dict[str, object] = {}
-    if query.equality is not None and not risky:
+    if query.equality is not None:
         # between observations a surrogate falls below every cost, which makes no point better than the best observed
         observed = arrays.costs if len(arrays.costs) else arrays.simulated_costs
         limit = max(float(expected[best]), float(observed.min())) + query.equality.tolerance
@@ -111,8 +107,6 @@ def describe(
         )
         description["predictions"] = tuple(map(float, predictions))
         description["prediction_deviations"] = tuple(map(float, spreads))
-        if isinstance(model.surrogate, RiskProcess):
-            description["risk"] = model.surrogate.answer(known)
     if query.map_resolution and query.space.dimension >= 2:
         sought = _seeks_minimum(query) and len(points) > 0
         at = np.array(query.map_at) if query.map_at else points[0] if sought else known[best]
@@ -329,8 +323,6 @@ def _feasibilities(feasibility: Feasibility | None, points: Array) -> tuple[floa
 def _candidates(arrays: QueryArrays, model: Model, rng: np.random.Generator) -> Array:
     """Candidates for the search: all over the region, and around the best observations."""
     seen = arrays.seen
-    if isinstance(model.surrogate, RiskProcess):
-        seen = np.clip(seen, 0.0, 1.0)  # executed points may lie outside the box
     means = model.surrogate.predict(seen)[0]
     # the seen places with the four smallest m(x)
     around = [seen[i] for i in np.argsort(means, kind="stable")[:4]]
@@ -365,7 +357,7 @@ def _search(
 
 def _seeks_minimum(query: SurrogateQuery) -> bool:
     """Whether the first proposal is the minimiser of the posterior mean."""
-    return isinstance(query, MinimumQuery | RiskQuery | PourQuery) and query.acquisition == "posterior_minimum"
+    return isinstance(query, MinimumQuery | PourQuery) and query.acquisition == "posterior_minimum"
 
 
 def _fills_space(query: ProposalQuery, arrays: QueryArrays, model: Model, index: int) -> bool:
@@ -393,9 +385,7 @@ def _kappa(query: ProposalQuery, model: Model) -> float:
     before its bottom is reached. The paper's methods (`plain`, the mean 'zero', pours after simulations), and contexts,
     are excluded.
     """
-    adapts = isinstance(query, RiskQuery) or (
-        isinstance(query, MinimumQuery) and query.mean == "constant" and not query.plain
-    )
+    adapts = isinstance(query, MinimumQuery) and query.mean == "constant" and not query.plain
     # κ/2 if ln p(y | GP) − ln p(y | noise) ≥ STRUCTURE
     return query.kappa * (SETTLED if adapts and model.process.evidence >= STRUCTURE else 1.0)
 
@@ -438,7 +428,6 @@ MAX_OBSERVATIONS = 2_000
 MAX_COUNT = 256
 MAX_RESOLUTION = 200
 MAX_PREDICTIONS = 100_000
-MAX_DISTURBANCES = 512
 
 
 def check(query: SuggestionQuery) -> None:
@@ -475,8 +464,6 @@ def _check_surrogate(query: SurrogateQuery) -> None:
         _check_points("simulated", query.simulated.points, dimension)
     if isinstance(query, CalibrationQuery):
         _check_calibration(query)
-    if isinstance(query, RiskQuery):
-        _check_risk(query)
     if isinstance(query, PourQuery):
         if query.discrepancy is not None:
             _check_discrepancy(query.discrepancy, dimension)
@@ -501,22 +488,6 @@ def _check_calibration(query: CalibrationQuery) -> None:
         raise ValueError(f"context points of different lengths: {sorted(lengths)}")
     _check_points("contexts", query.contexts, query.context_dimension)
     _check_posterior(query)
-
-
-def _check_risk(query: RiskQuery) -> None:
-    risk = query.risk
-    if not 1 <= len(risk.disturbances) <= MAX_DISTURBANCES:
-        raise ValueError(f"risk: {len(risk.disturbances)} disturbances are outside 1 … {MAX_DISTURBANCES}")
-    if not 0.0 <= risk.level < 1.0:
-        raise ValueError(f"risk: level = {risk.level} is outside [0, 1)")
-    if len(query.data) > 1 and not query.predict_at:
-        raise ValueError("risk: predict_at must name the requests that the best is one of")
-    for index, disturbance in enumerate(risk.disturbances):
-        sizes = len(disturbance.scales), len(disturbance.shifts), len(disturbance.context)
-        if sizes != (query.space.dimension, query.space.dimension, query.context_dimension):
-            raise ValueError(f"risk: disturbance {index} has {sizes} numbers, which fit neither space nor the others")
-        if not all(math.isfinite(value) for value in (*disturbance.scales, *disturbance.shifts, *disturbance.context)):
-            raise ValueError(f"risk: disturbance {index} is not finite")
 
 
 def _check_discrepancy(discrepancy: ModelDiscrepancy, dimension: int) -> None:

@@ -33,10 +33,8 @@ from actors.optimizer.questions import (
     PourQuery,
     ProposalQuery,
     RegressionQuery,
-    RiskQuery,
     SurrogateQuery,
 )
-from actors.optimizer.risk_measures import RiskProcess
 
 Array = NDArray[np.float64]
 
@@ -211,8 +209,6 @@ def fit(query: SurrogateQuery, arrays: QueryArrays) -> Model | None:
     else:
         process = constant_mean_process(points, costs, prior=prior)
     lengths = process.lengths[: query.space.dimension]
-    if isinstance(query, RiskQuery):
-        return Model(RiskProcess.of(process, query.risk), process, lengths)
     if isinstance(query, CalibrationQuery):
         # the process is of r − c_s(θ, a), and 1/J Σ_j |r − c_s(θ, a_j)| is minimised over θ
         context = array(query.contexts, query.context_dimension)

@@ -76,7 +76,6 @@ if TYPE_CHECKING:
     from actors.optimizer.questions import MinimumQuery as MinimumQuery
     from actors.optimizer.questions import PourQuery as PourQuery
     from actors.optimizer.questions import RegressionQuery as RegressionQuery
-    from actors.optimizer.questions import RiskQuery as RiskQuery
     from actors.optimizer.questions import SpaceFillingQuery as SpaceFillingQuery
     from actors.optimizer.questions import Suggestion as Suggestion
     from actors.optimizer.questions import SuggestionQuery as SuggestionQuery
@@ -93,7 +92,6 @@ if TYPE_CHECKING:
     from orchestrator.learning.deployment.deployment_base import Deployment as Deployment
     from orchestrator.learning.deployment.deployment_ledger import SearchSettings as SearchSettings
     from orchestrator.learning.deployment.objectives import Objective as Objective
-    from orchestrator.learning.deployment.objectives import Objectives as Objectives
     from orchestrator.learning.requests import Decision as Decision
     from orchestrator.learning.requests import Failed as Failed
     from orchestrator.learning.requests import Outcome as Outcome

@@ -221,31 +221,17 @@ class DeploymentSection(StageSettings):
     loss: Loss | None = None
     """Loss that is minimised."""
 
-    objectives: list[AnyObjective] | None = None
-    """Several objectives instead of a loss."""
-
-    floor: Annotated[float, Quantity("1", "0.5", 0.01, 1.0)] | None = None
-    """Minimum share of the load (of the target volume) that a pour must deliver to be better than none; 0.5 unless
-    given."""
+    objective: AnyObjective | None = None
+    """Objective that is minimised instead of a loss."""
 
     confirm: PourCount = 0
     """Pours of the recommended action at the end, which measure its outcome and do not influence the choice."""
 
     def check_values(self, problems: Problems) -> None:
-        """Check that the objectives replace the loss, and that each is named once."""
+        """Check that the objective replaces the loss."""
         super().check_values(problems)
-        if self.objectives is None:
-            if self.floor is not None and problems.valid("objectives"):
-                problems.add("belongs to 'objectives'; name some, or remove it", "floor", key=True)
-            return
-        if self.loss is not None:
-            problems.add("stands beside 'objectives'; keep one of them", "loss", key=True)
-        if not self.objectives:
-            problems.add("is empty; name at least one, for example '- {name: spilled}'", "objectives")
-        names = [objective.name for objective in self.objectives]
-        for i, name in enumerate(names):
-            if name in names[:i] and problems.within("objectives", i).valid("name"):
-                problems.add(f"{name} stands twice in the list; keep one of them", "objectives", i)
+        if self.objective is not None and self.loss is not None:
+            problems.add("is given as well as 'objective'; keep one of them", "loss", key=True)
 
     @property
     def settings(self) -> DeploymentSettings:

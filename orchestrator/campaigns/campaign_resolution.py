@@ -41,9 +41,8 @@ from orchestrator.learning.campaign_plan import (
     CampaignPlan,
     DeploymentPlan,
     NormalPrior,
-    Premises,
 )
-from orchestrator.learning.deployment.objectives import STOPS, Objectives
+from orchestrator.learning.deployment.objectives import STOPS
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import MINIMUM_POURED, Loss
 from sim_engine.scene import Scene
@@ -86,21 +85,6 @@ class StageGround:
         return self.builder.scene(name, self.pourer, receiver, self.motions, searched, self.place, **options)
 
 
-def _objectives(
-    section: DeploymentSection, place: Place, scene: Scene, actions: Space, report: Report
-) -> Objectives | None:
-    """The objectives that replace a loss; None if none are given."""
-    if section.objectives is None:
-        return None
-    names = [objective.name for objective in section.objectives]
-    for i, objective in enumerate(section.objectives):
-        if not report.is_broken(place.at("objectives", i, "name")):
-            beside = frozenset(names[:i] + names[i + 1 :])
-            objective.check(scene, actions, beside, PlacedProblems(place.at("objectives", i), report))
-    floor = 0.5 if section.floor is None else section.floor
-    return Objectives(tuple(section.objectives), floor)
-
-
 def resolve_deployment(
     section: DeploymentSection, builder: SceneBuilder, place: Place, laboratory: LaboratorySettings | None
 ) -> DeploymentPlan | None:
@@ -113,7 +97,7 @@ def resolve_deployment(
     builder.refuse_prior(section.actions, place, why)
     if known:
         problems = PlacedProblems(place, report, frozenset(DeploymentSection.model_fields))
-        settings.check(Premises(actions, section.objectives is not None), problems)
+        settings.check(problems)
     if settings.pours and laboratory is not None and not laboratory.pours:
         at = place.at("pours") if "pours" in settings.model_fields_set else place
         hint = "name one with a bench" if settings.learns_on_pours else "'pours: 0' only plans"
@@ -122,7 +106,7 @@ def resolve_deployment(
         text = f"laboratory '{laboratory.name}' has no bench to pour on; name one with a bench, or remove it"
         report.add(place.at("confirm"), text)
     loss = section.loss or Loss()
-    if actions is not None and section.objectives is None:
+    if actions is not None and section.objective is None:
         _check_that_pouring_pays(loss, actions, place.at("loss"), report)
     scenes = []
     for receiver in ground.receivers or [None]:
@@ -133,6 +117,8 @@ def resolve_deployment(
         scenes.append(scene)
     if actions is None or not known:
         return None
+    if section.objective is not None and not report.is_broken(place.at("objective", "name")):
+        section.objective.check(scenes[0], actions, PlacedProblems(place.at("objective"), report))
     data = None
     if isinstance(section, LearningSettings) and section.data is not None:
         data = resolve_data(section.data, place.at("data"), tuple(scenes), actions, laboratory, report)
@@ -142,7 +128,7 @@ def resolve_deployment(
         actions=actions,
         loss=loss,
         data=data,
-        objectives=_objectives(section, place, scenes[0], actions, report),
+        objective=section.objective,
         constraints=ground.constraints,
         confirm=section.confirm,
     )
@@ -162,7 +148,7 @@ def _check_that_pouring_pays(loss: Loss, actions: Space, place: Place, report: R
         at,
         f"{verb} is least where next to nothing is poured, and with {' and '.join(stops)} searched a pour can stop so "
         f"early; fix {' and '.join(stops)} under motion, use spilled_and_retained with a retained_weight above 0, or "
-        "'objectives' with their 'floor'",
+        "an 'objective' with its 'floor'",
     )
 
 

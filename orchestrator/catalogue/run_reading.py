@@ -114,7 +114,7 @@ POURS = (
     Column("loss", "number", "what the deployment minimised, as measured", "of loss_name"),
     Column("predicted_loss", "number", "what its strategy expected", "of loss_name"),
     Column("predicted_deviation", "number", "how well that was known: its standard deviation", "of loss_name"),
-    Column("loss_name", "text", "which loss, see `loss` of a campaign; 'objectives' for a weighted sum"),
+    Column("loss_name", "text", "which loss, see `loss` of a campaign; or which objective"),
     Column("reason", "text", "why it failed"),
     Column("seconds", "number", "from its request to its outcome", "s"),
     Column("prediction_error", "number", "(loss − expected) / standard deviation of a single pour as predicted", "SD"),
@@ -250,8 +250,9 @@ def _pour(pour: RunPour, plan: Mapping[str, Any], scenes: Mapping[str, Any]) -> 
     scene = scenes.get(request.scene, {})
     calibrating = request.calibrates(scene["name"] for scene in deployment.get("scenes", ()))
     minimised = not calibrating and request.dose is None
-    # The loss of weighted objectives needs the plan: use `decant.open_run(run).pours`.
-    loss = None if not minimised or deployment.get("objectives") is not None else Loss(**deployment["loss"])
+    # The value of an objective needs the plan: use `decant.open_run(run).pours`.
+    objective = deployment.get("objective") or {}
+    loss = None if not minimised or objective else Loss(**deployment["loss"])
     measured = None
     if loss is not None and pour.measured is not None:
         particles = int((plan.get("parameters") or {}).get("particles", 0))
@@ -271,7 +272,7 @@ def _pour(pour: RunPour, plan: Mapping[str, Any], scenes: Mapping[str, Any]) -> 
         "liquid": scene.get("liquid", {}).get("name", ""),
         "outcome": "open" if pour.outcome is None else pour.state,
         "loss": measured,
-        "loss_name": "" if not minimised else "objectives" if loss is None else loss.name,
+        "loss_name": "" if not minimised else objective["name"] if loss is None else loss.name,
         "predicted_deviation": None if request.predicted is None else request.predicted.deviation,
         "seconds": pour.seconds,
         **_checks(pour, measured),

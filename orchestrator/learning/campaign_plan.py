@@ -22,15 +22,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from actors.laboratory_settings import LaboratorySettings
-from actors.optimizer.questions import WRITTEN_IF_SET, BenchOffset, CalibrationPours, Linear, Point
+from actors.optimizer.questions import WRITTEN_IF_SET, BenchOffset, CalibrationPours, Linear
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory
-from orchestrator.learning.deployment.objectives import Objectives
+from orchestrator.learning.deployment.objectives import Objective
 from orchestrator.learning.strategy import plural
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import MINIMUM_POURED, Loss
 from sim_engine.prediction_band import CalibrationResidual
-from sim_engine.scene import PoseError, Scene
+from sim_engine.scene import Scene
 from sim_engine.search_space import Space
 from sim_engine.settings.model import (
     NOT_IN_FINGERPRINT,
@@ -102,19 +102,6 @@ class CalibrationSettings(StrategySettings):
         """Build the strategy."""
 
 
-@dataclass(frozen=True)
-class Premises:
-    """Properties of a deployment that its settings are checked against.
-
-    Attributes:
-        actions: searched action space; None if it is invalid.
-        objectives: whether the deployment minimises objectives instead of a loss.
-    """
-
-    actions: Space | None
-    objectives: bool
-
-
 class DeploymentSettings(StrategySettings):
     """Settings of a deployment, which pours into vessels that calibration has not used."""
 
@@ -127,7 +114,7 @@ class DeploymentSettings(StrategySettings):
     pours: PourCount | None = None
     """Real pours per receiver."""
 
-    def check(self, premises: Premises, complaints: Problems) -> None:
+    def check(self, complaints: Problems) -> None:
         """Add a problem for each combination of values that is invalid."""
         if not self.learns_on_pours:
             return
@@ -141,18 +128,9 @@ class DeploymentSettings(StrategySettings):
             complaints.add(f"{self.strategy} learns on real pours; at least 1 (D1 plans without any)", "pours")
 
     @property
-    def needs_posterior(self) -> bool:
-        """Whether the strategy plans with draws of θ given the pours of a calibration."""
-        return False
-
-    @property
     def learns_offsets(self) -> bool:
         """Whether the strategy uses estimates of the bench from calibration or from pours into another receiver."""
         return False
-
-    def draws(self, plan: DeploymentPlan, parameters: SimulationParameters, count: int, seed: int) -> Sequence[Draw]:
-        """Deviations from the plan under which a recommended action is predicted; empty: none."""
-        return ()
 
     @property
     def simulations(self) -> int:
@@ -442,7 +420,7 @@ class DeploymentPlan(StagePlan):
         scenes: one per receiver.
         actions: searched action space.
         data: pours from before the campaign.
-        objectives: objectives to minimise instead of the loss.
+        objective: minimised instead of the loss.
         constraints: constraints on actions in addition to the bounds of their space.
         confirm: number of repetitions of the recommended action in each scene after the strategy has ended.
         thetas: equally likely draws of a posterior, which simulations use in turn. They are given if no calibration of
@@ -460,7 +438,7 @@ class DeploymentPlan(StagePlan):
     actions: Space
     loss: Loss
     data: ExistingPours | None = None
-    objectives: Objectives | None = None
+    objective: Objective | None = None
     constraints: tuple[Linear, ...] = ()
     confirm: int = 0
     thetas: tuple[SimulationParameters, ...] = ()
@@ -475,14 +453,14 @@ class DeploymentPlan(StagePlan):
         return self.settings.pours or 0
 
     def wanted(self, scene: Scene) -> float:
-        """Volume that should arrive in a scene's receiver [m³]: the whole load unless the objectives request less."""
-        share = 1.0 if self.objectives is None else self.objectives.wanted(scene)
+        """Volume that should arrive in a scene's receiver [m³]: the whole load unless the objective requests less."""
+        share = 1.0 if self.objective is None else self.objective.wanted(scene)
         return share * scene.liquid.volume
 
     @property
     def loss_name(self) -> str:
         """Name of the minimised quantity in results."""
-        return self.loss.name if self.objectives is None else "objectives"
+        return self.loss.name if self.objective is None else self.objective.name
 
 
 @dataclass(frozen=True)
@@ -633,20 +611,6 @@ class CampaignPlan:
         """The prior from earlier campaigns, of the stage that uses it."""
         stages = (stage for stage in (self.calibration, self.deployment) if stage is not None)
         return next((stage.memory for stage in stages if stage.memory is not None), None)
-
-
-@dataclass(frozen=True)
-class Draw:
-    """One deviation of a pour from its plan.
-
-    Attributes:
-        error: pose error of the execution; None: as planned.
-        z: standardised errors, in the order of `Disturbances.errors`.
-    """
-
-    error: PoseError | None
-    parameters: SimulationParameters
-    z: Point
 
 
 def receiver_names(plan: CampaignPlan) -> dict[str, str]:

@@ -42,7 +42,7 @@ from sim_engine.prediction_band import (
     shift_of,
     spreads,
 )
-from sim_engine.scene import PoseError, Scene
+from sim_engine.scene import Scene
 
 FINE = 20_000
 """Number of particles of the simulation that shows how much the resolution matters."""
@@ -178,7 +178,6 @@ class RepeatedSimulation:
         count: int,
         seed: int,
         thetas: Sequence[SimulationParameters] = (),
-        errors: Sequence[PoseError | None] = (),
         residual: CalibrationResidual | None = None,
     ) -> None:
         """Queue the simulations.
@@ -189,8 +188,6 @@ class RepeatedSimulation:
                 then.
             count: number of seeds.
             thetas: draws of a posterior that the seeds cycle through instead of the single θ.
-            errors: pose errors that the seeds cycle through. If the cups touch because of such an error, the simulation
-                has the worst loss; it does not count as lost.
             residual: of the calibration, for the scene; None if unknown.
         """
         scene, parameters = costing.scene, costing.parameters
@@ -208,9 +205,9 @@ class RepeatedSimulation:
         self.decisions: list[Decision] = []
         if action is not None:
             seeds_of_all = [seeds.next() for _ in range(count)]
-            turns, missed, uncertain = thetas or (parameters,), errors or (None,), scene.uncertain
+            turns, uncertain = thetas or (parameters,), scene.uncertain
             self._unissued = [
-                Simulate(scene.name, action, turns[i % len(turns)], s, "predict", missed[i % len(missed)], uncertain)
+                Simulate(scene.name, action, turns[i % len(turns)], s, "predict", drawn_shapes=uncertain)
                 for i, s in enumerate(seeds_of_all)
             ]
             first = self._unissued[0]
@@ -220,7 +217,6 @@ class RepeatedSimulation:
                 self._fine = replace(first, parameters=first.parameters.model_copy(update={"particles": FINE}))
                 self._unissued.insert(0, self._fine)
             among = f" and {len(set(thetas))} θ of the posterior" if thetas else ""
-            among += f" under {len(errors)} draws of the pose error" if any(errors) else ""
             among += ", each with shapes that the vessels may have" if uncertain else ""
             self.decisions.append(Decision(f"simulate the planned action with {count} new seeds{among}"))
         self._thetas = len(set(thetas))
@@ -256,10 +252,10 @@ class RepeatedSimulation:
         cost = costing.simulated(outcome, request.action)
         if isinstance(outcome, Simulated) and cost is not None:
             self._outcomes.append(outcome.outcome)
-            self._losses.append(costing.total(cost))
-        elif cost is not None and (request.pose_error is not None or request.drawn_shapes):
+            self._losses.append(cost)
+        elif cost is not None and request.drawn_shapes:
             self._touching += 1
-            self._losses.append(costing.total(cost))
+            self._losses.append(cost)
         else:
             self._lost += 1
 
@@ -397,7 +393,7 @@ class Confirmation:
         trial.take(outcome, self._costing.scene, self._costing, penalised=False)
         if trial.status == "refused":
             self._count = len(self._pours) + 1  # it would be refused again
-        row = trial.row((), self._costing.scene.liquid)
+        row = trial.row(self._costing.scene.liquid)
         self._pours.append(
             ConfirmingPour(
                 number=row.number,

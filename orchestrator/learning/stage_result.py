@@ -9,10 +9,10 @@ Reading and writing of results is in `orchestrator.records.codec`, the list of a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, model_validator
 
 from actors.optimizer.questions import SurrogateMap
 from sim_engine.action import ACTION_DIMENSIONS
@@ -31,6 +31,16 @@ class ResultPart(BaseModel):
     """Part of a result. It is immutable, and its JSON form has exactly the declared fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_earlier_version(cls, data: Any) -> Any:
+        return without_empty_extras(data, cls.model_fields) if isinstance(data, Mapping) else data
+
+
+def without_empty_extras(data: Mapping[str, Any], names: Container[str]) -> dict[str, Any]:
+    """Written fields without the empty ones that have no name here: an earlier version had them."""
+    return {key: value for key, value in data.items() if key in names or value not in (None, [], (), {})}
 
 
 class StageResult(ResultPart):

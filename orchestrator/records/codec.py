@@ -23,7 +23,7 @@ from pydantic import BaseModel, ValidationError
 from actors.optimizer.questions import WRITTEN_IF_SET
 from orchestrator.learning.requests import Outcome, Request
 from orchestrator.learning.run_errors import RunError
-from orchestrator.learning.stage_result import StageResult
+from orchestrator.learning.stage_result import StageResult, without_empty_extras
 
 T = TypeVar("T")
 _FLOAT = "$float"
@@ -89,9 +89,12 @@ class Difference:
 
 
 def first_difference(expected: Any, actual: Any, path: tuple[str | int, ...] = ()) -> Difference | None:
-    """The first place where two JSON-ready values differ; None if they are equal."""
+    """The first place where two JSON-ready values differ; None if they are equal. A key with null is as a missing key:
+    versions differ in the fields that they write.
+    """
     if isinstance(expected, dict) and isinstance(actual, dict):
-        inner = [(key, expected.get(key, NOTHING), actual.get(key, NOTHING)) for key in sorted(expected | actual)]
+        present = (key for key in sorted(expected | actual) if (expected.get(key), actual.get(key)) != (None, None))
+        inner = [(key, expected.get(key, NOTHING), actual.get(key, NOTHING)) for key in present]
     elif isinstance(expected, list) and isinstance(actual, list) and len(expected) == len(actual):
         inner = [(index, *pair) for index, pair in enumerate(zip(expected, actual, strict=True))]
     elif NOTHING not in (expected, actual) and canonical(expected) == canonical(actual):
@@ -186,10 +189,14 @@ def _converter() -> Any:
 
     @c.register_structure_hook_factory(dataclasses.is_dataclass)
     def read_dataclass(cls: Any) -> Any:
-        fields = make_dict_structure_fn(cls, c, **choices(cls))
+        fields, names = (
+            make_dict_structure_fn(cls, c, **choices(cls)),
+            {field.name for field in dataclasses.fields(cls)},
+        )
 
         def read(data: Any, _: Any) -> Any:
-            return fields({key: value for key, value in _expect(data, dict).items() if key != _TYPE}, cls)
+            written = {key: value for key, value in _expect(data, dict).items() if key != _TYPE}
+            return fields(without_empty_extras(written, names), cls)
 
         return read
 

@@ -27,7 +27,7 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 from orchestrator.learning.stage_result import StageResult
-from orchestrator.records.codec import CodecError, canonical, digest, first_difference
+from orchestrator.records.codec import CodecError, canonical, first_difference
 from orchestrator.records.events import (
     CampaignStateChanged,
     Event,
@@ -438,10 +438,10 @@ class Journal(JournalReader):
         return self
 
     def _check_same_campaign(self, header: Header) -> None:
-        if digest(self.header.fingerprint) == digest(header.fingerprint):
-            return
         difference = first_difference(self.header.fingerprint, header.fingerprint)
-        if difference is not None and difference.path[-1:] == ("mirrored",) and difference.actual is True:
+        if difference is None:
+            return
+        if difference.path[-1:] == ("mirrored",) and difference.actual is True:
             raise JournalError(
                 f"{self.path}: this run simulated whole pours, and now one half would be simulated. Write 'symmetry: "
                 "off' under 'simulator' in the campaign's file to resume it, or begin a new run"

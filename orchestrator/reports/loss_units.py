@@ -92,16 +92,15 @@ def named_loss_unit(name: str) -> LossUnit:
 
 
 def deployment_unit(plan: DeploymentPlan) -> LossUnit:
-    """Display unit of a deployment's loss, or of its weighted sum of objectives."""
-    if plan.objectives is None:
+    """Display unit of a deployment's loss, or of its objective."""
+    if plan.objective is None:
         return loss_unit(plan.loss)
-    weights = [(objective.weight, objective.name.replace("_", " ")) for objective in plan.objectives.parts]
-    return LossUnit(f"{' + '.join(n if w == 1.0 else f'{w:g} × {n}' for w, n in weights)} [%]", "%", 100.0)
+    return LossUnit(f"{plan.objective.name.replace('_', ' ')} [%]", "%", 100.0)
 
 
 def largest_loss(plan: DeploymentPlan) -> float:
     """Maximum of a deployment's loss, in its own unit; infinite if it depends on the load."""
-    if plan.objectives is not None or plan.loss.name in ("grams", "particles"):
+    if plan.objective is not None or plan.loss.name in ("grams", "particles"):
         return math.inf
     return max(plan.loss.retained_weight, 1.0) if plan.loss.name == "spilled_and_retained" else 1.0
 
@@ -146,8 +145,8 @@ def loss_of_pour(plan: CampaignPlan, pour: Pour, measured: PourMeasurement) -> f
         return abs(measured.delivered - pour.dose.amount)
     if plan.deployment is None or is_calibration(plan, pour):
         return measured.fractions.spillage
-    if plan.deployment.objectives is not None:
+    if plan.deployment.objective is not None:
         scene = next(scene for scene in plan.deployment.scenes if scene.name == pour.scene)
         costing = Costing.of(plan.deployment, scene, plan.parameters)
-        return costing.total(costing.poured(measured, pour.action))
+        return costing.poured(measured, pour.action)
     return plan.deployment.loss(measured.fractions, loaded_mass=measured.loaded, particles=plan.parameters.particles)

@@ -16,7 +16,7 @@ from pydantic import Field, SerializeAsAny, create_model
 
 from orchestrator.learning.calibration.calibration_scores import CalibrationGain
 from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
-from orchestrator.learning.deployment.deployment_result import Recommended, RiskFound
+from orchestrator.learning.deployment.deployment_result import Recommended
 from orchestrator.learning.deployment.model_monitoring import Believed
 from orchestrator.learning.deployment.real_pours import PourRow, PredictionCheck
 from orchestrator.learning.single_action import Confirmed
@@ -239,7 +239,6 @@ class ReceiverSummary(ResultPart):
     model_check: PredictionCheck | Believed
     gave_up: str | None
     ended: str | None
-    risk: RiskFound | None
     prediction: dict[str, SampleStatistics] | None
     """Result of repeated simulations of the recommended action with new seeds, by quantity."""
 
@@ -267,8 +266,12 @@ class ReceiverSummary(ResultPart):
 
 
 PLANNED = (
-    *("prediction", "prediction_interval", "at_bounds", "predicted_delivered_g", "predicted_delivered_ml"),
-    *("risk", "not_covered"),
+    "prediction",
+    "prediction_interval",
+    "at_bounds",
+    "predicted_delivered_g",
+    "predicted_delivered_ml",
+    "not_covered",
 )
 """Fields of a receiver's summary that a plan for it gives beside the action."""
 

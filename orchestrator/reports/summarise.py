@@ -404,7 +404,6 @@ def _receiver(
         model_check=result.model_check,
         gave_up=result.gave_up,
         ended=result.ended,
-        risk=result.risk,
         prediction=prediction,
         prediction_interval=None if predicted is None else predicted.interval,
         at_bounds=() if plan is None or advised is None else tuple(style.at_ends(advised.action_si, plan.actions.axes)),

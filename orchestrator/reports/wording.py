@@ -1,7 +1,7 @@
 """Sentences and tables about a run, each made once.
 
 Sentences are written when the result document is made (`orchestrator.reports.summarise`): `advice`, `standing`,
-`open_questions`, `what_was_asked`, `cost`, `theta_sentences`, and one line each for a risk, a prediction
+`open_questions`, `what_was_asked`, `cost`, `theta_sentences`, and one line each for a prediction
 interval and the use of the pool. The tables arrange the document's values; the console and the page render them.
 """
 
@@ -18,7 +18,7 @@ from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
 from orchestrator.learning.calibration.pour_residuals import PourResidual
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan
 from orchestrator.learning.deployment.deployment_ledger import EQUAL_LOSS
-from orchestrator.learning.deployment.deployment_result import Recommended, RiskFound
+from orchestrator.learning.deployment.deployment_result import Recommended
 from orchestrator.learning.deployment.model_monitoring import DOUBT, Believed
 from orchestrator.learning.deployment.real_pours import PredictionCheck
 from orchestrator.learning.dispense import Dispensed
@@ -64,16 +64,6 @@ def trust_line(trust: PredictionCheck | Believed) -> str | None:
         "the first pours were far from their predictions; the simulator may not fit this vessel"
         if trust.alarm
         else None
-    )
-
-
-def risk_line(risk: RiskFound, unit: LossUnit) -> str:
-    """'under pose error and θ: CVaR 90 % 4.10 %, expected 2.30 %, pours differ by ± 1.40 %'."""
-    thetas = f" and {risk.thetas} θ of the posterior" if risk.thetas else ""
-    worst = f"CVaR {100 * risk.level:g} % {unit.text(max(risk.value, 0.0))}, " if risk.measure == "cvar" else ""
-    return (
-        f"best action under errors of execution{thetas}: {worst}expected {unit.text(max(risk.expected, 0.0))}, "
-        f"pours differ by ± {unit.text(risk.spread)}"
     )
 
 
@@ -134,8 +124,6 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
             if row.pours != 1
             else f"The loss of the only weighed pour was {best}."
         )
-    if row.risk is not None:
-        lines.append(_sentence(risk_line(row.risk, unit)))
     if row.ended:
         lines.append(f"The search stopped: {row.ended.rstrip('.')}.")
     if _is_confirmed(row) and (trust := trust_line(row.model_check)) is not None:
@@ -217,7 +205,7 @@ def _open(row: ReceiverSummary) -> list[str]:
     confirming = () if row.confirmed is None else row.confirmed.pours
     if lost := [f"pour {pour.number}: {pour.failed}" for pour in confirming if pour.failed]:
         lines.append(f"Confirming pours that failed: {'; '.join(lost)}.")
-    if row.risk is None and row.recommended is not None:
+    if row.recommended is not None:
         lines.append("Errors of grip, placement and speed are included only as they occurred in these pours.")
     return lines + [f"Not simulated at this action, {gap.kind}: {gap.text}." for gap in row.not_covered]
 

@@ -175,8 +175,6 @@ class RunService:
         warned: list[Problem] = []
         checked = check_campaign(request.campaign, as_written=request.as_written, warn=warned.append, doing=doing)
         problems = [str(fault) for fault in checked]
-        if (problem := _lacking_posterior(request.campaign)) is not None:
-            problems.append(problem)
         return CheckReport(tuple(problems), tuple(dict.fromkeys(map(str, warned))))
 
     def check_laboratory(self, request: RunRequest, resources: RunResources) -> None:
@@ -373,27 +371,3 @@ class RunHandle:
         await asyncio.wait({self._task, noted}, timeout=BETWEEN_CANCELS, return_when=asyncio.FIRST_COMPLETED)
         noted.cancel()
         self._task.cancel()
-
-
-def _lacking_posterior(plan: CampaignPlan) -> str | None:
-    """Draws of θ that deployment is to bear are given, or made by the campaign's own calibration; else the problem."""
-    from orchestrator.learning.strategy_registry import calibrations
-
-    if plan.deployment is None or not plan.deployment.settings.needs_posterior or plan.deployment.thetas:
-        return None
-    if plan.calibration is not None and plan.calibration.settings.makes_posterior:
-        return None
-    known = [name for name, settings in calibrations().items() if settings().makes_posterior]
-    has = "has no calibration"
-    if plan.calibration is not None and plan.calibration.strategy not in known:
-        has = f"calibrates with {plan.calibration.strategy}"
-    elif plan.calibration is not None:
-        return (
-            f"{plan.source}: deployment.risk.theta: 'posterior' needs draws of θ, which no surrogate makes that "
-            "takes actions for noise; write 'calibration: {averaging: context}', or 'theta: best'"
-        )
-    return (
-        f"{plan.source}: deployment.risk.theta: 'posterior' needs draws of θ, which only {' and '.join(known)} "
-        f"makes, and this campaign {has}; calibrate with {known[0]}, write 'theta: best', or use decant plan "
-        "--parameters with the theta.json of a calibration"
-    )

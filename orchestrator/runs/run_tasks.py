@@ -66,7 +66,7 @@ def read_theta(path: Path, plan: CampaignPlan) -> GivenTheta:
 
     Args:
         path: of the file.
-        plan: whose θ has what the file does not name; if its risk needs draws of a posterior, the file needs them.
+        plan: whose θ has what the file does not name.
 
     Raises:
         ConfigError: anything is wrong with the file.
@@ -78,9 +78,7 @@ def read_theta(path: Path, plan: CampaignPlan) -> GivenTheta:
         predicts_with_posterior,
     )
 
-    needed = plan.deployment is not None and plan.deployment.settings.needs_posterior
-    needed = needed or predicts_with_posterior(path)
-    draws = load_posterior(path, POSTERIOR_DRAWS, plan.parameters) if needed else ()
+    draws = load_posterior(path, POSTERIOR_DRAWS, plan.parameters) if predicts_with_posterior(path) else ()
     return GivenTheta(load_parameters(path, plan.parameters), draws, load_discrepancy(path))
 
 
@@ -138,11 +136,6 @@ def plan_task(
     if deployment is None:
         raise RunTaskError(
             f"{plan.source}: has no 'deployment' section; it says which actions may be planned (actions, motion, loss)"
-        )
-    if deployment.settings.needs_posterior and not theta.draws:
-        raise RunTaskError(
-            f"{plan.source}: deployment.risk.theta: 'posterior' needs --parameters, the theta.json of a calibration by "
-            "C4 (in a program: theta), or a calibration in the same run"
         )
     scenes = deployment.scenes
     if receiver is not None:

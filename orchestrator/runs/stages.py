@@ -308,13 +308,9 @@ def prediction_stages(
         def build(results: Results, seed: int) -> Strategy:
             recommended = result_of(results, DEPLOYMENT + name, Deployed).recommended
             action = None if recommended is None else scene.action(dict(recommended.action_si))
-            theta, known = _theta(plan, results), with_posterior(deployment, results)
-            costing = Costing.of(deployment, scene, theta)
-            draws = known.settings.draws(known, theta, seeds, seed)
-            chosen = [draw.parameters for draw in draws] if known.settings.needs_posterior else thetas
-            errors = [draw.error for draw in draws]
+            costing = Costing.of(deployment, scene, _theta(plan, results))
             left = None if deployment.left_over is None else deployment.left_over.at(scene)
-            return RepeatedSimulation(costing, action, seeds, seed, chosen, errors, left)
+            return RepeatedSimulation(costing, action, seeds, seed, thetas, left)
 
         return build
 
@@ -329,18 +325,12 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
     There are none if the calibration has no posterior, or if the weighed pours do not justify θ*. A strategy that
     learns the bench's offsets from its pours receives what calibration knows of them separately (`with_offsets`): if
     offsets were searched, its simulations use θ*.
-
-    Raises:
-        RunError: the settings need a posterior, and the calibration has none.
     """
     if deployment.thetas:
         return deployment
     theta = calibrated_theta(results) if CALIBRATION in results else None
     posterior = () if theta is None or theta.posterior is None else theta.posterior.thetas
-    if deployment.settings.needs_posterior:
-        if not posterior:
-            raise RunError("deployment.risk: theta: posterior, but no calibration of this campaign tells one; C4 does")
-    elif (
+    if (
         theta is None
         or not posterior
         or not _justified(results)

@@ -30,7 +30,6 @@ from orchestrator.learning.campaign_plan import (
     CalibrationPlan,
     CampaignPlan,
     DeploymentPlan,
-    Premises,
     StrategySettings,
 )
 from orchestrator.learning.deployment.d1 import D1Settings
@@ -556,7 +555,7 @@ def _compared_deployments(
         if not after_calibration and len(rounds) > 1:
             report.add(at.at("iterations"), f"{len(rounds)} numbers, but the baseline is one plan; give one: [15]")
         settings = kind.like(base.settings, without=BUDGETS, **changes)
-        settings.check(Premises(base.actions, base.objectives is not None), PlacedProblems(at, report))
+        settings.check(PlacedProblems(at, report))
         common = replace(base, settings=settings, data=None, confirm=0)  # a study has its own 'confirm'
         if rounds is None:
             strategies.append(ComparedDeployment(_label(key), common, repetitions))

@@ -190,7 +190,7 @@ class FinalPour:
         self._pour.tell(request, outcome)
         match outcome:
             case Poured(measurement) if is_sound(measurement.fractions):
-                loss = self._costing.total(self._costing.poured(measurement, self._action))
+                loss = self._costing.poured(measurement, self._action)
                 spillage = measurement.fractions.spillage
                 self._made = FinalPoured(
                     action_si=self._action.values(),

@@ -228,21 +228,6 @@ def test_a_refused_table_leaves_no_run_and_names_the_place_of_its_error(tmp_path
     assert not (tmp_path / "runs").exists()
 
 
-RISK = {"measure": "cvar", "level": 0.9, "theta": "posterior", "pose_error": {"x": "3 mm"}}
-
-
-def risky(folder: Path, *, calibration: bool = True) -> decant.CampaignPlan:
-    """A campaign whose deployment bears draws of θ."""
-    plan = decant.load_campaign(decant.shipped("campaigns/quickstart.yaml"))
-    kept = {key: plan.resolved["deployment"][key] for key in ("receiver", "motion", "actions")}
-    kept = {key: value for key, value in kept.items() if value is not None}
-    changes: dict[str, Any] = {"deployment": {"strategy": "D1", **kept, "risk": RISK}}
-    if not calibration:
-        changes["simulator"] = {"parameters": {"particles": 500}}
-        changes["calibration"] = None
-    return small(folder, **changes)
-
-
 @pytest.fixture
 def fake_simulators(monkeypatch: pytest.MonkeyPatch) -> None:
     """Campaigns of the library with simulators that make numbers up."""
@@ -254,18 +239,7 @@ def fake_simulators(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("actors.laboratory.open_laboratory", partial(open_laboratory, make=make_fake()))
 
 
-def test_draws_of_theta_that_no_calibration_makes_are_refused_before_a_run_begins(tmp_path: Path) -> None:
-    with pytest.raises(decant.RunError, match="this campaign has no calibration") as refused:
-        decant.run(risky(tmp_path, calibration=False))
-    assert isinstance(refused.value, ValueError)
-    with pytest.raises(decant.DecantError, match=r"needs --parameters, .*\(in a program: theta\)"):
-        decant.plan(risky(tmp_path))
-    assert not (tmp_path / "runs").exists()
-
-
-def test_a_campaign_that_bears_draws_of_theta_is_planned_with_those_of_a_calibration(
-    tmp_path: Path, fake_simulators: None
-) -> None:
+def test_a_campaign_is_planned_with_the_draws_of_a_calibration(tmp_path: Path, fake_simulators: None) -> None:
     import json
 
     rows = [{"theta": {"friction": friction}, "weight": 1.0} for friction in (0.1, 0.3)]
@@ -278,7 +252,7 @@ def test_a_campaign_that_bears_draws_of_theta_is_planned_with_those_of_a_calibra
         if isinstance(request, Simulate):
             seen.add(request.parameters.friction)
 
-    planned = decant.plan(risky(tmp_path), theta=theta, iterations=2, seeds=2, watch=[watch])
+    planned = decant.plan(small(tmp_path), theta=theta, iterations=2, seeds=2, watch=[watch])
     assert planned.recommended
     assert {0.1, 0.3} <= seen <= {0.1, 0.2, 0.3}
 

@@ -138,9 +138,9 @@ FEATURES = {
     "D3": Feature("`deployment: {strategy: D3}`", _nothing, ("D3",)),
     "doses": Feature("`dispense`, `decant dose`", _doses),
     "mixtures": Feature("`mixtures`", _mixtures),
-    "objectives": Feature(
-        "`deployment: {objectives: […]}`",
-        _under("deployment", objectives=[{"name": "spilled"}, {"name": "time"}]),
+    "objective": Feature(
+        "`deployment: {objective: {…}}`",
+        _under("deployment", objective={"name": "spilled"}),
         ("D2", "D1", "D3"),
     ),
     "risk limit": Feature("`deployment: {risk_limit: {…}}`", _under("deployment", risk_limit={}), ("D3",)),
@@ -223,8 +223,8 @@ class Run:
 TOGETHER = (
     ("calibration", "D3", "doses", "risk limit", "prior"),
     ("calibration", "D1", "doses", "prior"),
-    ("D2", "objectives", "recordings", "places", "unattended"),
-    ("calibration", "D3", "mixtures", "objectives", "risk limit"),
+    ("D2", "objective", "recordings", "places", "unattended"),
+    ("calibration", "D3", "mixtures", "objective", "risk limit"),
 )
 """Campaigns that have every feature between them: each is run in every way."""
 
@@ -242,13 +242,13 @@ RUNS = [
 ] + [
     Run(features, ("in process", "library"))
     for features in (
-        ("calibration", "D3", "objectives", "risk limit", "prior", "recordings", "places", "unattended"),
+        ("calibration", "D3", "objective", "risk limit", "prior", "recordings", "places", "unattended"),
         ("calibration", "D1", "prior", "recordings", "places", "unattended"),
-        ("calibration", "D2", "objectives", "recordings", "places", "unattended"),
-        ("D1", "objectives", "recordings", "places", "unattended"),
-        ("calibration", "D2", "doses", "objectives"),
-        ("D1", "objectives", "doses"),
-        ("D3", "objectives", "doses"),
+        ("calibration", "D2", "objective", "recordings", "places", "unattended"),
+        ("D1", "objective", "recordings", "places", "unattended"),
+        ("calibration", "D2", "doses", "objective"),
+        ("D1", "objective", "doses"),
+        ("D3", "objective", "doses"),
         ("doses", "recordings", "places", "unattended"),
         ("calibration", "D1", "mixtures"),
         ("D2", "mixtures"),

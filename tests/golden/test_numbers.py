@@ -25,7 +25,6 @@ from actors.optimizer.questions import (
     CalibrationQuery,
     Data,
     DesignQuestion,
-    Disturbance,
     Limit,
     Linear,
     MinimumQuery,
@@ -34,8 +33,6 @@ from actors.optimizer.questions import (
     PosteriorQuestion,
     PourQuery,
     RegressionQuery,
-    Risk,
-    RiskQuery,
     SpaceFillingQuery,
     Suggestion,
     SuggestionQuery,
@@ -155,20 +152,6 @@ QUERIES: dict[str, SuggestionQuery] = {
         count=0,
         posterior=PosteriorQuestion((), (), 0.02, count=20, prior=((0.5, 0.2), (0.5, 0.0))),
         design=DesignQuestion(points(4, 15), points(5, 16)),
-    ),
-    "risk, CVaR": RiskQuery(
-        PLANE,
-        POURED,
-        seed=11,
-        predict_at=ASKED,
-        risk=Risk(tuple(Disturbance((1.0, 1.0 + 0.02 * i), (0.01 * i, 0.0)) for i in range(-3, 4)), 0.7),
-    ),
-    "risk, mean": RiskQuery(
-        PLANE,
-        POURED,
-        seed=11,
-        predict_at=ASKED,
-        risk=Risk(tuple(Disturbance((1.0, 1.0), (0.01 * i, 0.0)) for i in range(-3, 4))),
     ),
 }
 """Queries of every type, with every acquisition, mean and noise."""

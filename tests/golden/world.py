@@ -15,8 +15,6 @@ from actors.optimizer.questions import (
     DiscrepancyFound,
     Posterior,
     PourQuery,
-    RiskAnswer,
-    RiskQuery,
     SpaceFillingQuery,
     Suggestion,
     SuggestionQuery,
@@ -153,7 +151,6 @@ def answer(query: SuggestionQuery) -> Suggestion:
         bands=tuple((0.02, 0.12) for _ in points) if adaptive else (),
         posterior=Posterior(thetas, (0.02,) * len(thetas), 15.0) if calibration and query.posterior else None,
         best_noise=0.01,
-        risk=_risk(query) if isinstance(query, RiskQuery) else None,
         gains=tuple(noise(name, "gain", i) for i in range(len(query.design.candidates)))
         if calibration and query.design
         else (),
@@ -170,12 +167,6 @@ def _words(query: SuggestionQuery) -> tuple[str, str]:
         case PourQuery():
             return "simulated" if query.discrepancy is None else "adaptive", query.acquisition
     return getattr(query, "mean", "constant"), getattr(query, "acquisition", "lcb")
-
-
-def _risk(query: RiskQuery) -> RiskAnswer:
-    asked = len(query.predict_at)
-    expected = tuple(0.05 + 0.01 * noise("expected", query.seed, i) for i in range(asked))
-    return RiskAnswer(expected, (0.01,) * asked)
 
 
 def _discrepancy(query: PourQuery, dimension: int) -> DiscrepancyFound:

@@ -185,7 +185,7 @@ deployment:
   receiver: cone.yaml
   motion: {max_angle: 115 deg, height: 60 mm}
   actions: {angular_velocity: [60 deg/s, 100 deg/s], x_offset: [60 mm, 90 mm]}
-  objectives: [{name: spilled}, {name: gentle, weight: 0.2, rough: 100 deg/s}]
+  objective: {name: gentle, rough: 100 deg/s}
   pours: 2
 outputs: {directory: runs}
 """
@@ -216,7 +216,7 @@ def test_a_campaign_of_things_from_outside_is_run_from_beginning_to_end(decant: 
     assert resolved["laboratory"]["balance"]["kind"] == "spring"
     assert resolved["laboratory"]["arm"]["kind"] == "stand"
     assert resolved["deployment"]["receiver"]["cone"]["top"] == "0.045 m"
-    assert any(part["name"] == "gentle" for part in resolved["deployment"]["objectives"])
+    assert resolved["deployment"]["objective"]["name"] == "gentle"
     again = decant("validate", str(run / "resolved.json"), cwd=folder)
     assert again.returncode == 0, again.stderr
 

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from decant.plugins import DeploymentPlan, Loss, Objectives
+from decant.plugins import DeploymentPlan, Fractions, Loss
 from decant.plugins.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
-from orchestrator.learning.deployment.objectives import Spilled
 from tests.plugins.decant_example.objective import Gentle
 from tests.plugins.decant_example.strategy import Hypercube, HypercubeSettings
 from tests.support.toy_spillage import narrow_cup
@@ -46,14 +45,14 @@ def test_it_does_what_every_strategy_has_to_do() -> None:
     check_strategy(lambda: Hypercube(plan(), SCENE, THETA, 3), narrow_cup)
 
 
-def test_an_objective_of_ones_own_takes_part_in_the_weighted_sum() -> None:
-    objectives = Objectives((Spilled(), Gentle(weight=0.3)))
-    assert objectives.names == ("spilled", "gentle")
+def test_an_objective_of_ones_own_is_rated_with_its_floor() -> None:
+    objective = Gentle(floor=0.5)
     slow, fast = (SCENE.action(ACTIONS.decode([u, 0.5])) for u in (0.0, 1.0))
-    worst = objectives.worst(SCENE, ACTIONS)
-    costs = [objectives.parts[1].cost(None, action, SCENE) for action in (slow, fast)]  # type: ignore[arg-type]
+    worst = objective.worst(SCENE, ACTIONS)
+    assert worst == pytest.approx(120 / 90)
+    costs = [objective.bounded_cost(Fractions(1.0, 0.0, 0.0), action, SCENE, worst) for action in (slow, fast)]
     assert costs == pytest.approx([15 / 90, 120 / 90])
-    assert worst == (1.0, pytest.approx(120 / 90))
+    assert objective.bounded_cost(Fractions(0.0, 0.0, 1.0), slow, SCENE, worst) == pytest.approx(2 * worst)
 
 
 # -- what knows it -----------------------------------------------------------------------------------------------------
@@ -102,7 +101,7 @@ deployment:
   actions: {{angular_velocity: [20 deg/s, 120 deg/s], x_offset: [70 mm, 130 mm]}}
   pours: 5
   centred: true
-  objectives: [{{name: spilled}}, {{name: gentle, rough: 60 deg/s, weight: 0.2}}]
+  objective: {{name: gentle, rough: 60 deg/s}}
 """
 
 BAD = {
@@ -170,8 +169,8 @@ def test_schema_and_tables_have_its_keys_and_their_meanings(known: dict[str, Any
         ("misspelt", ":11:3: deployment.centerd: unknown key; did you mean 'centred'?"),
         ("not-its-own", ":11:3: deployment.prior_simulations: belongs to D3, not to hypercube; remove it"),
         ("nobodys", ":8:13: deployment.strategy: 'hyprcube' is not known here; did you mean 'hypercube'?"),
-        ("not-of-the-objective", "objectives[1].volume: belongs to target_volume, not to gentle; remove it"),
-        ("without-a-unit", "objectives[1].rough: 60 has no unit; write '60 deg/s' if that is what is meant"),
+        ("not-of-the-objective", "objective.volume: belongs to target_volume, not to gentle; remove it"),
+        ("without-a-unit", "objective.rough: 60 has no unit; write '60 deg/s' if that is what is meant"),
         ("no-pours", ":7:1: deployment: key 'pours' is missing; hypercube learns on real pours"),
     ],
 )

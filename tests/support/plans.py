@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta
 from orchestrator.learning.calibration.posterior_summary import PosteriorFound, RemainingDiscrepancy
 from orchestrator.learning.campaign_plan import CalibrationPlan, DeploymentPlan
-from orchestrator.learning.deployment.disturbances import PoseNoise, RiskSettings
 from orchestrator.learning.strategy_registry import STRATEGIES
 from orchestrator.runs.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
-from sim_engine.scene import PoseError
 from sim_engine.search_space import Space
 
 CALM: dict[str, dict[str, Any]] = {"D3": {"model": "residual", "simulations_per_pour": 0}}
@@ -62,17 +59,6 @@ def deployment_plan(**changes: Any) -> DeploymentPlan:
 def unit(action: Action, space: Space = ACTIONS) -> np.ndarray:
     """An action as a point of the unit cube."""
     return space.encode({name: getattr(action, name) for name in space.names})
-
-
-def risk(
-    measure: Literal["expected", "cvar"] = "expected",
-    level: float | None = None,
-    pose_error: PoseError | None = None,
-    theta: Literal["best", "posterior"] = "best",
-) -> RiskSettings:
-    """What D1 has to bear; errors are standard deviations."""
-    errors = asdict(pose_error or PoseError(speed_factor=0.0))
-    return RiskSettings(measure=measure, level=level, pose_error=PoseNoise(**errors), theta=theta)
 
 
 def calibrated(

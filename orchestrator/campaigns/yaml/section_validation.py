@@ -246,7 +246,10 @@ REMOVED = {
     "smallest_top_up": "this limit of doses is fixed; remove it",
     "on_failed_pour": "a pour that fails while it is made counts as the worst loss; remove it",
     "discrepancy_policy": "a simulator that seems wrong is weighted accordingly and reported; remove it",
-    "pareto": "the weighted sum of the objectives is minimised; give each a 'weight', and remove it",
+    "pareto": "a deployment has one 'objective'; remove it",
+    "objectives": "weighted sums are gone; give one, as 'objective: {name: target_volume, volume: 150 mL}'",
+    "floor": "it is a key of the objective: 'objective: {name: spilled, floor: 0.5}'",
+    "risk": "planning under errors of execution is gone; remove it, and 'decant simulate' predicts deviations",
     "costs": "simulations run while the arm pours, 'simulations_per_pour' of them; remove it",
 }
 """Remedies for keys of earlier versions."""

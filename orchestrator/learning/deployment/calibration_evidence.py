@@ -167,4 +167,4 @@ def _evidence(
 def _cost(costing: Costing, pair: WeighedPair, spillage: float) -> float:
     """Cost of a pour if it had spilled this fraction of the liquid that left the pourer."""
     measurement = PourMeasurement(1.0, spillage * pair.poured, 1.0 - pair.poured)
-    return costing.total(costing.poured(measurement, pair.action))
+    return costing.poured(measurement, pair.action)

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Annotated, Literal
 
 from actors.optimizer.questions import FOUND, Limit, MinimumQuery, Suggestion, found_good
-from orchestrator.learning.campaign_plan import DeploymentPlan, Premises
+from orchestrator.learning.campaign_plan import DeploymentPlan
 from orchestrator.learning.deployment.deployment_base import MAP_RESOLUTION, Deployment
 from orchestrator.learning.deployment.deployment_ledger import SearchSettings
 from orchestrator.learning.deployment.deployment_result import Deployed
@@ -77,9 +77,9 @@ class D3Settings(SearchSettings):
         pours = plural(self.pours or 0, "pour")
         return f"{plural(self.prior_simulations, 'simulation')}{most}, then {pours} with {between} beside each"
 
-    def check(self, premises: Premises, complaints: Problems) -> None:
+    def check(self, complaints: Problems) -> None:
         """Check that each key belongs to the selected model."""
-        super().check(premises, complaints)
+        super().check(complaints)
         for key in () if self.adaptive else ("risk_limit", "stop", "good_enough"):
             if getattr(self, key) is not None:
                 complaints.add(f"needs 'model: adaptive', not '{self.model}'", key, key=True)
@@ -162,7 +162,7 @@ class Hybrid(Deployment[D3Settings]):
         follows the first good one."""
         fixed, spent = self._settings.prior_simulations, self._ledger.spent
         costs = self._ledger.simulated().costs
-        if not self._settings.adaptive or self._plan.objectives is not None or not costs:
+        if not self._settings.adaptive or self._plan.objective is not None or not costs:
             return fixed
         if self._found_at is None and (found_good(costs) or min(costs) < FOUND * self._ledger.costing.worst):
             self._found_at = spent

@@ -74,7 +74,7 @@ class DeploymentReport:
             parts: further fields of the result.
         """
         ledger, final, decode = self._ledger, self.final, self._plan.actions.decode
-        names, latest = ledger.costing.names, final or self.latest_map
+        latest = final or self.latest_map
         if gave_up is None and ledger.refused >= MAX_REFUSED:
             gave_up = f"{ledger.refused} pours were refused as invalid; the action space hardly allows any"
         recommended = None
@@ -87,9 +87,7 @@ class DeploymentReport:
             simulations=ledger.trials.answered,
             simulations_lost=ledger.trials.lost,
             simulations_refused=sum(trial.refused for trial in ledger.trials.all),
-            pours=tuple(
-                p.row(names, ledger.scene.liquid) for p in [*ledger.added, *ledger.pours] if p.status != "pouring"
-            ),
+            pours=tuple(p.row(ledger.scene.liquid) for p in [*ledger.added, *ledger.pours] if p.status != "pouring"),
             simulated=tuple(
                 SimulatedAction(action_si=decode(trial.point), loss=trial.cost)
                 for trial in ledger.trials.all
@@ -100,7 +98,6 @@ class DeploymentReport:
             failed_pours=sum(p.status == "failed" for p in ledger.pours),
             model_check=model_check or trust([p for p in ledger.pours if p.status == "weighed" and p.cost is not None]),
             gave_up=gave_up,
-            objectives=names,
             map=None if latest is None else displayed_map(latest.surrogate, self._plan.actions),
             recommended=recommended,
             **parts,

@@ -10,14 +10,12 @@ Nothing is requested here: `deployment_base` does.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from actors.optimizer.questions import Data, Equality, Point, SpaceFillingQuery, SurrogateQuery
 from orchestrator.learning.calibration.calibration_base import Kappa
-from orchestrator.learning.campaign_plan import DeploymentPlan, DeploymentSettings, Draw
+from orchestrator.learning.campaign_plan import DeploymentPlan, DeploymentSettings
 from orchestrator.learning.deployment.costing import Costing
-from orchestrator.learning.deployment.objectives import Vector
 from orchestrator.learning.deployment.real_pours import PourTrial, point_of, prior_pours
 from orchestrator.learning.requests import ADDED, Decision, Failed, Outcome, Pour, Prediction, Request, Simulate
 from orchestrator.learning.trials import SeedStream, Trials
@@ -86,12 +84,10 @@ class DeploymentLedger:
 
     def settle(self, request: Simulate, outcome: Outcome) -> None:
         """Record the outcome of a simulation."""
-        avoided = request.pose_error is None  # under an error, touching is what may happen
-        if avoided and isinstance(outcome, Failed) and outcome.kind == "invalid_action":
+        if isinstance(outcome, Failed) and outcome.kind == "invalid_action":
             self.trials.settle(request, None, refused=True)
         else:
-            vector = self.costing.of_theta(request.parameters).simulated(outcome, request.action)
-            self.trials.settle(request, None if vector is None else self.costing.total(vector))
+            self.trials.settle(request, self.costing.of_theta(request.parameters).simulated(outcome, request.action))
 
     def begin(self, point: Point, predicted: Prediction | None) -> PourTrial:
         """Enter a pour that is about to be requested."""
@@ -170,19 +166,19 @@ class DeploymentLedger:
     # -- data for surrogates ---------------------------------------------------------------------------------------
 
     @property
-    def known(self) -> list[tuple[Point, Vector]]:
+    def known(self) -> list[tuple[Point, float]]:
         """Pours that the strategy did not request: from before the campaign, and added by hand."""
-        return [*self.former, *((p.point, p.vector) for p in self.added if p.vector is not None)]
+        return [*self.former, *((p.point, p.cost) for p in self.added if p.cost is not None)]
 
     @property
-    def poured(self) -> list[tuple[Point, Vector]]:
+    def poured(self) -> list[tuple[Point, float]]:
         """All pours with a cost."""
-        return [*self.known, *((p.point, p.vector) for p in self.pours if p.vector is not None)]
+        return [*self.known, *((p.point, p.cost) for p in self.pours if p.cost is not None)]
 
     def real(self) -> Data:
         """Observations of the real cost; those from before the campaign come first."""
         poured = self.poured
-        return Data(tuple(point for point, _ in poured), tuple(self.costing.total(vector) for _, vector in poured))
+        return Data(tuple(point for point, _ in poured), tuple(cost for _, cost in poured))
 
     def simulated(self, *, everything: bool = False) -> Data:
         """Observations of the simulated cost that the next choice may use; with `everything`, all."""
@@ -211,11 +207,6 @@ class DeploymentRequests:
         scene, seeds = self.ledger.scene.name, self._seeds
         return tuple(Simulate(scene, action, self._next_theta(), seeds.next(), purpose) for _ in range(repeats))
 
-    def simulations_under(self, action: Action, purpose: str, draws: Sequence[Draw]) -> tuple[Simulate, ...]:
-        """Simulations of one action, one under each draw of errors and θ."""
-        scene, seeds = self.ledger.scene.name, self._seeds
-        return tuple(Simulate(scene, action, draw.parameters, seeds.next(), purpose, draw.error) for draw in draws)
-
     def _next_theta(self) -> SimulationParameters:
         """The next of the plan's draws of θ, in an order of which any section covers them evenly; θ* without draws."""
         thetas = self._plan.thetas
@@ -240,8 +231,8 @@ class DeploymentRequests:
 
     @property
     def equality(self) -> Equality | None:
-        """When a recommended action is equal to a gentler one; None with objectives, which weigh speed themselves."""
-        if self._plan.objectives is not None:
+        """When a recommended action is equal to a gentler one; None with an objective, which rates speed itself."""
+        if self._plan.objective is not None:
             return None
         speed = "angular_velocity" if "angular_velocity" in self._plan.actions.names else ""
         return Equality(EQUAL_LOSS * self.ledger.costing.everything_spilled, speed)

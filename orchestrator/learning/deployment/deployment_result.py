@@ -76,28 +76,6 @@ class Recommended(ResultPart):
         )
 
 
-class RiskFound(ResultPart):
-    """The recommended action under execution errors and posterior θ."""
-
-    measure: Literal["expected", "cvar"]
-    """Minimised measure."""
-
-    level: float
-    """Fraction of the worst cases that the CVaR averages."""
-
-    value: float
-    """The measure, in the loss' own unit."""
-
-    expected: float
-    """Mean over the disturbances."""
-
-    spread: float
-    """Standard deviation over them."""
-
-    thetas: int
-    """Number of posterior θ among them; 0 with a single θ."""
-
-
 class SimulatedAction(ResultPart):
     """A simulated action with its loss."""
 
@@ -159,17 +137,11 @@ class Deployed(StageResult):
     bench: BenchFound | None = None
     """Deviation of the bench from the simulator, for the next receiver."""
 
-    objectives: tuple[str, ...] = ()
-    """Names of several objectives; empty with a plain loss."""
-
     map: DisplayedMap | None = None
     """The loss over the two most important dimensions."""
 
     recommended: Recommended | None = None
     """The recommended action; None before the end, and without any usable outcome."""
-
-    risk: RiskFound | None = None
-    """The risk measure, if the action was planned under errors."""
 
     @property
     def weighed(self) -> Sequence[PourRow]:

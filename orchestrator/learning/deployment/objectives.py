@@ -1,14 +1,13 @@
-"""Several objectives of a pour: little liquid spilled, little left, short duration, a given volume.
+"""Objectives of a pour: little liquid spilled, little left, short duration, a given volume.
 
-- `Objective` is the base class; `Spilled`, `Retained`, `Time` and `TargetVolume` are the built-in objectives.
-- `Objectives` combines them into a weighted sum.
+`Objective` is the base class; `Spilled`, `Retained`, `Time` and `TargetVolume` are the built-in objectives. A
+deployment minimises one of them instead of a loss.
 """
 
 from __future__ import annotations
 
 import itertools
 from abc import abstractmethod
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from sim_engine.action import Action
@@ -22,9 +21,6 @@ from sim_engine.settings.quantity import Quantity
 if TYPE_CHECKING:
     from sim_engine.settings.model import Problems
 
-Vector = tuple[float, ...]
-"""One number for each objective; smaller is better."""
-
 STOPS = ("max_angle", "hold_time")
 """Dimensions of an action that can end a pour before the pourer is empty."""
 
@@ -35,6 +31,9 @@ class Objective(Settings):
     A derived class defines one objective: its settings, its equation and its worst value. It is registered as an entry
     point of the group `decant.objectives` under its `name`, a literal. Its value must be a function of fractions,
     action and scene alone.
+
+    Not pouring spills nothing and takes no time. A pour that delivers less than `floor` of the wanted volume (the load,
+    or the target volume) is therefore worse than any pour that delivers enough.
     """
 
     tag: ClassVar[str] = "name"
@@ -44,12 +43,12 @@ class Objective(Settings):
     name: str = ""
     """Name of the objective."""
 
-    weight: Annotated[float, Quantity("1", "1.0", 1e-6, 1e6)] = 1.0
-    """Weight in the weighted sum."""
+    floor: Annotated[float, Quantity("1", "0.5", 0.01, 1.0)] = 0.5
+    """Minimum share of the load (of the target volume) that a pour must deliver to be better than none."""
 
     @abstractmethod
     def cost(self, fractions: Fractions, action: Action, scene: Scene) -> float:
-        """Value f of a pour that delivers enough."""
+        """Value f of a pour that delivers enough; smaller is better."""
 
     def worst(self, scene: Scene, actions: Space) -> float:
         """Largest f of a pour that delivers enough."""
@@ -59,8 +58,23 @@ class Objective(Settings):
         """Fraction of the load that should arrive."""
         return 1.0
 
-    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Problems) -> None:
-        """Add problems that the objective has in a scene or in combination with the other objectives."""
+    def check(self, scene: Scene, actions: Space, complaints: Problems) -> None:
+        """Add problems that the objective has in a scene."""
+
+    def bounded_cost(self, fractions: Fractions, action: Action, scene: Scene, worst: float) -> float:
+        """The minimised value of a pour.
+
+        If the pour delivers too little, it is the worst one times 1 + the missing fraction of the floor. The slope
+        leads the search back to pouring.
+
+        Args:
+            worst: result of `worst`.
+        """
+        least = self.floor * self.wanted(scene)
+        delivered = max(fractions.poured - fractions.spilled, 0.0)
+        if delivered < least:
+            return (2.0 - delivered / least) * worst
+        return min(self.cost(fractions, action, scene), worst)
 
 
 class Spilled(Objective):
@@ -84,12 +98,6 @@ class Retained(Objective):
         """The retained fraction."""
         return fractions.retained
 
-    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Problems) -> None:
-        """Check that there is no target volume, which contradicts this objective."""
-        if "target_volume" in beside:
-            text = "wants the pourer to be emptied, and target_volume what is over to stay in it; keep one of them"
-            complaints.add(text)
-
 
 class Time(Objective):
     """Duration of the motion / scale."""
@@ -109,7 +117,7 @@ class Time(Objective):
         corners = itertools.product((0.0, 1.0), repeat=actions.dimension)
         return max(duration(scene.action(actions.decode(corner))) for corner in corners) / self.scale
 
-    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Problems) -> None:
+    def check(self, scene: Scene, actions: Space, complaints: Problems) -> None:
         """Check that the hold has a known duration."""
         if "hold_time" not in actions.names and scene.fixed.get("hold_time") is None:
             text = "needs a hold that lasts a known time; search hold_time, or fix it under motion ('hold_time: 1.5 s')"
@@ -147,7 +155,7 @@ class TargetVolume(Objective):
         assert self.volume is not None, "checked"
         return self.volume / scene.liquid.volume
 
-    def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Problems) -> None:
+    def check(self, scene: Scene, actions: Space, complaints: Problems) -> None:
         """Check that the target is within the load, and that an action can stop the pour."""
         if self.volume is None:
             text = "key 'volume' is missing; add for example 'volume: 150 mL'"
@@ -160,54 +168,6 @@ class TargetVolume(Objective):
         if not set(STOPS) & set(actions.names):
             text = "needs an action that stops the pour; search max_angle or hold_time ('hold_time: [0 s, 3 s]')"
             complaints.add(text)
-
-
-@dataclass(frozen=True)
-class Objectives:
-    """Objectives that deployment minimises instead of a loss: Σ w_j f_j(a).
-
-    Not pouring spills nothing and takes no time. A pour that delivers less than `floor` of the wanted volume (the load,
-    or the target volume) is therefore worse in every objective than any pour that delivers enough. Its values are the
-    worst ones, times 1 + the missing fraction of the floor. The slope leads the search back to pouring.
-
-    Attributes:
-        floor: fraction that must be delivered, > 0.
-    """
-
-    parts: tuple[Objective, ...]
-    floor: float = 0.5
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the objectives, in order."""
-        return tuple(objective.name for objective in self.parts)
-
-    def vector(self, fractions: Fractions, action: Action, scene: Scene, worst: Vector) -> Vector:
-        """Values f_j of a pour.
-
-        Args:
-            worst: result of `worst`.
-        """
-        least = self.floor * self.wanted(scene)
-        delivered = max(fractions.poured - fractions.spilled, 0.0)
-        if delivered < least:
-            missing = 1.0 - delivered / least
-            return tuple((1.0 + missing) * value for value in worst)
-        return tuple(
-            min(goal.cost(fractions, action, scene), value) for goal, value in zip(self.parts, worst, strict=True)
-        )
-
-    def worst(self, scene: Scene, actions: Space) -> Vector:
-        """Largest f_j of a pour that delivers enough."""
-        return tuple(objective.worst(scene, actions) for objective in self.parts)
-
-    def total(self, vector: Vector) -> float:
-        """Σ w_j f_j."""
-        return sum(objective.weight * value for objective, value in zip(self.parts, vector, strict=True))
-
-    def wanted(self, scene: Scene) -> float:
-        """Fraction of the load that should arrive."""
-        return min(objective.wanted(scene) for objective in self.parts)
 
 
 def duration(action: Action) -> float:

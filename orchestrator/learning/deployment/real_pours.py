@@ -18,7 +18,6 @@ from typing import Literal
 from actors.optimizer.questions import Point
 from orchestrator.learning.campaign_plan import ExistingPours
 from orchestrator.learning.deployment.costing import Costing
-from orchestrator.learning.deployment.objectives import Vector
 from orchestrator.learning.requests import Decision, Failed, Outcome, Poured, Prediction
 from orchestrator.learning.stage_result import ResultPart, WeighedMasses, displayed_action, weighed_masses
 from orchestrator.learning.strategy import is_sound
@@ -76,9 +75,6 @@ class PourRow(WeighedMasses):
     loss: float | None
     """Loss in its own unit; the worst loss for a failed pour that is penalised."""
 
-    objectives: dict[str, float]
-    """Values by name of objective, if there are several."""
-
     delivered_ml: float | None = None
     """The delivered mass as a volume [ml], from the liquid's density."""
 
@@ -98,7 +94,7 @@ class PourTrial:
     """A real pour: its action, its prediction and its outcome.
 
     Attributes:
-        cost, vector: value for the data, as one number and as objectives; None: the pour adds no data.
+        cost: value for the data; None: the pour adds no data.
         status: 'pouring', 'weighed', 'refused' (an invalid action: nothing was poured), 'failed', or 'added' (not
             asked for).
         mishap: whether the pour failed during its execution, for example because the vessels touched.
@@ -114,7 +110,6 @@ class PourTrial:
     reason: str = ""
     mishap: bool = False
     measurement: PourMeasurement | None = None
-    vector: Vector | None = None
 
     def take(self, outcome: Outcome, scene: Scene, costing: Costing, *, penalised: bool) -> None:
         """Record the outcome; it replaces an earlier one.
@@ -128,14 +123,13 @@ class PourTrial:
         Raises:
             ValueError: the outcome is not one of a pour.
         """
-        self.cost = self.vector = self.measurement = None
+        self.cost = self.measurement = None
         self.reason, self.mishap = "", False
         match outcome:
             case Poured(measurement) if not is_sound(measurement.fractions):
                 self.status, self.reason = "failed", "weighing: the balance gave no numbers"
             case Poured(measurement):
-                self.vector = costing.poured(measurement, scene.action(self.values))
-                self.cost, self.status = costing.total(self.vector), "weighed"
+                self.cost, self.status = costing.poured(measurement, scene.action(self.values)), "weighed"
                 self.measurement = measurement
             case Failed("invalid_action", reason):
                 self.status, self.reason = "refused", reason
@@ -145,10 +139,10 @@ class PourTrial:
             case _:
                 raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
         if self.status == "failed" and penalised:
-            self.cost, self.vector = costing.worst, costing.worst_vector
+            self.cost = costing.worst
 
-    def row(self, objectives: tuple[str, ...], liquid: Liquid) -> PourRow:
-        """The pour's form in results; `objectives` are their names, if any, and `liquid` is the poured liquid."""
+    def row(self, liquid: Liquid) -> PourRow:
+        """The pour's form in results."""
         weighed, predicted = self.measurement, self.predicted
         return PourRow(
             number=self.number,
@@ -161,7 +155,6 @@ class PourTrial:
             predicted_scatter=None if predicted is None else predicted.scatter,
             predicted_interval=None if predicted is None else predicted.of_a_pour(),
             loss=self.cost,
-            objectives={} if self.vector is None else dict(zip(objectives, self.vector, strict=False)),
             **weighed_masses(weighed).model_dump(),
             delivered_ml=None if weighed is None else liquid.millilitres(weighed.delivered),
         )
@@ -180,10 +173,8 @@ def expecting(text: str, prediction: Prediction) -> Decision:
     return Decision(text, expected)
 
 
-def prior_pours(
-    data: ExistingPours, scene: Scene, actions: Space, costing: Costing
-) -> tuple[tuple[Point, Vector], ...]:
-    """Points and objectives of the pours from before the campaign in a scene."""
+def prior_pours(data: ExistingPours, scene: Scene, actions: Space, costing: Costing) -> tuple[tuple[Point, float], ...]:
+    """Points and costs of the pours from before the campaign in a scene."""
     pours = []
     for pour in data.pours.get(scene.name, ()):
         measured = PourMeasurement(pour.poured + pour.retained, pour.spilled, pour.retained)

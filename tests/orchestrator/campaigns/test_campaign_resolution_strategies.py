@@ -15,6 +15,7 @@ from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.deployment.objectives import TargetVolume
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 
@@ -155,67 +156,70 @@ def test_any_loss_may_be_had_where_every_pour_empties_the_pourer(loss: str, tmp_
     assert plan.deployment is not None
 
 
-def objectives(*parts: str, more: str = "") -> str:
-    return f"{DEPLOYED}  objectives: [{', '.join(parts)}]\n{more}"
+def objective(text: str) -> str:
+    return f"{DEPLOYED}  objective: {text}\n"
 
 
-def test_objectives_are_read_in_si_and_written_out_again(tmp_path: Path) -> None:
-    text = objectives(TARGET, "{name: time, weight: 0.2, scale: 6 s}", more="  floor: 0.3\n")
-    plan = load(tmp_path, text)
+def test_an_objective_is_read_in_si_and_written_out_again(tmp_path: Path) -> None:
+    plan = load(tmp_path, objective(TARGET.replace("}", ", floor: 0.3}")))
     assert plan.deployment is not None
-    found = plan.deployment.objectives
-    assert found is not None
-    target, time = found.parts
-    assert (target.name, target.weight, target.volume, target.tolerance) == ("target_volume", 1.0, 1.5e-4, 2e-6)
-    assert (time.name, time.weight, time.scale) == ("time", 0.2, 6.0)
-    assert found.floor == 0.3
-    assert plan.deployment.loss_name == "objectives"
+    target = plan.deployment.objective
+    assert isinstance(target, TargetVolume)
+    assert (target.volume, target.tolerance, target.floor) == (1.5e-4, 2e-6, 0.3)
+    assert plan.deployment.loss_name == "target_volume"
     (tmp_path / "again.json").write_text(json.dumps(plan.resolved))
     assert dataclasses.replace(load_campaign(tmp_path / "again.json"), source=plan.source) == plan
     assert fingerprint(plan) != fingerprint(load(tmp_path, DEPLOYED))
-    assert fingerprint(plan)["deployment"]["objectives"]["floor"] == 0.3
+    assert fingerprint(plan)["deployment"]["objective"]["floor"] == 0.3
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (objectives("{name: spiled}"), "objectives[0].name: 'spiled' is not known here; did you mean 'spilled'?"),
+        (objective("{name: spiled}"), "objective.name: 'spiled' is not known here; did you mean 'spilled'?"),
         (
-            objectives("{name: spillage}"),
+            objective("{name: spillage}"),
             "spillage is spilled / poured, and this objective is spilled / loaded: write 'spilled'",
         ),
-        (objectives("{weight: 2}"), "deployment.objectives[0]: key 'name' is missing"),
-        (objectives(), "deployment.objectives: is empty; name at least one"),
-        (objectives("{name: spilled}", "{name: spilled}"), "objectives[1]: spilled stands twice in the list"),
-        (objectives("{name: spilled, volume: 1 mL}"), "volume: belongs to target_volume, not to spilled; remove it"),
+        (objective("{floor: 0.5}"), "deployment.objective: key 'name' is missing"),
+        (objective("{name: spilled, volume: 1 mL}"), "volume: belongs to target_volume, not to spilled; remove it"),
+        (objective("{name: target_volume}"), "objective: key 'volume' is missing; add for example"),
+        (objective(TARGET.replace("150", "250")), "volume: is 250 mL, and only 200.4 mL are loaded (liquid.mass)"),
+        (objective(TARGET.replace("150 mL", "150 g")), "volume: '150 g' is a mass; should be a volume"),
+        (objective(TARGET.replace(" 2 mL", " 160 mL")), "tolerance: is as much as the volume: not pouring would do"),
+        (objective("{name: spilled}") + "  loss: {name: grams}\n", "loss: is given as well as 'objective'; keep one"),
         (
-            objectives("{name: target_volume}"),
-            "objectives[0]: key 'volume' is missing; add for example",
-        ),
-        (objectives(TARGET.replace("150", "250")), "volume: is 250 mL, and only 200.4 mL are loaded (liquid.mass)"),
-        (objectives(TARGET.replace("150 mL", "150 g")), "volume: '150 g' is a mass; should be a volume"),
-        (objectives(TARGET.replace(" 2 mL", " 160 mL")), "tolerance: is as much as the volume: not pouring would do"),
-        (objectives(TARGET, "{name: retained}"), "objectives[1]: wants the pourer to be emptied, and target_volume"),
-        (
-            objectives("{name: spilled}", more="  pareto: true\n"),
-            "pareto: unknown key; the weighted sum of the objectives is minimised; give each a 'weight', and remove it",
-        ),
-        (objectives("{name: spilled}", more="  loss: {name: grams}\n"), "loss: stands beside 'objectives'; keep one"),
-        (DEPLOYED + "  floor: 0.3\n", "deployment.floor: belongs to 'objectives'; name some, or remove it"),
-        (
-            objectives(TARGET)
+            objective(TARGET)
             .replace(", max_angle: [70 deg, 125 deg], hold_time: [0 s, 3 s]", "")
             .replace("motion: {", "motion: {max_angle: 120 deg, "),
-            "objectives[0]: needs an action that stops the pour; search max_angle or hold_time",
+            "objective: needs an action that stops the pour; search max_angle or hold_time",
         ),
         (
-            objectives("{name: time}").replace(", hold_time: [0 s, 3 s]", ""),
-            "objectives[0]: needs a hold that lasts a known time; search hold_time, or fix it under motion",
+            objective("{name: time}").replace(", hold_time: [0 s, 3 s]", ""),
+            "objective: needs a hold that lasts a known time; search hold_time, or fix it under motion",
         ),
     ],
 )
-def test_objectives_that_make_no_sense_are_refused(text: str, expected: str, tmp_path: Path) -> None:
+def test_an_objective_that_makes_no_sense_is_refused(text: str, expected: str, tmp_path: Path) -> None:
     assert expected in refusal(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("pareto: true", "pareto: unknown key; a deployment has one 'objective'; remove it"),
+        (
+            "objectives: [{name: spilled}, {name: time, weight: 0.2}]",
+            "objectives: unknown key; weighted sums are gone; give one, as 'objective: {name: target_volume, ",
+        ),
+        ("floor: 0.3", "floor: unknown key; it is a key of the objective: 'objective: {name: spilled, floor: 0.5}'"),
+        ("risk: {measure: cvar, theta: posterior}", "risk: unknown key; planning under errors of execution is gone; "),
+    ],
+)
+def test_a_key_that_is_gone_is_one_error_that_says_so(line: str, expected: str, tmp_path: Path) -> None:
+    text = refusal(tmp_path, f"{DEPLOYED}  {line}\n")
+    assert expected in text
+    assert text.count("campaign.yaml:") == 1
 
 
 CONFIRMED = f"""\

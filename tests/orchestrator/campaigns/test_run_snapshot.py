@@ -147,9 +147,6 @@ def sensible(section: dict[str, Any]) -> dict[str, Any]:
     kept = dict(section)
     if kept["strategy"] in ("D2", "D3"):
         kept["pours"] = max(kept.get("pours", 1), 1)
-    if (risk := kept.get("risk")) is not None:
-        kept["simulations_per_iteration"] = max(kept.get("simulations_per_iteration", 2), 2)
-        kept["risk"] = {key: value for key, value in risk.items() if key != "level"} | {"theta": "posterior"}
     wanted = {"C1": ("grid", "points_per_axis"), "C2": ("samples",), "C3": ("iterations",), "C4": ("simulations",)}
     if own := wanted.get(kept["strategy"]):
         first = next((key for key in own if key in kept), own[-1])
@@ -170,7 +167,7 @@ LOSSES = st.sampled_from(
         {},
         {"loss": {"retained_weight": 0.123456789}},
         {"loss": {"name": "spilled_and_retained"}},
-        {"objectives": [{"name": "spilled", "weight": 0.3}, {"name": "retained"}], "floor": 0.7},
+        {"objective": {"name": "spilled", "floor": 0.7}},
     ]
 )
 MOTIONS = st.sampled_from([{}, {"hold_time": "0.3 s"}, {"max_hold_time": "3.3 s", "pivot": {"x": "3 mm", "z": "4 mm"}}])
@@ -208,7 +205,6 @@ def test_whatever_is_asked_for_is_kept(
     content["motion"] = {**content.get("motion", {}), **motion}
     content["calibration"] = {key: content["calibration"][key] for key in COMMON if key in content["calibration"]}
     deployment = sensible(deployment)
-    more = {} if {"risk", "window"} & deployment.keys() else more
     content["calibration"] |= sensible(calibration)
     content["deployment"] = {key: content["deployment"][key] for key in COMMON[:3]} | deployment | more
     (folder / "campaign.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")

@@ -151,10 +151,8 @@ def test_a_load_that_is_not_told_is_refused(given: str, said: str, folder: Path)
     assert text.count("bad.yaml:") == 1
 
 
-OBJECTIVES = """\
-  objectives:
-    - {name: spilled}
-    - {name: target_volume, volume: 50 mL, tolerance: 2 mL}
+OBJECTIVE = """\
+  objective: {name: target_volume, volume: 50 mL, tolerance: 2 mL}
 """
 
 
@@ -171,9 +169,9 @@ def test_a_receiver_needs_to_hold_only_what_is_asked_for(folder: Path) -> None:
     (problem,) = check_campaign(load_campaign(write(folder, "all.yaml", deployed)))
     assert "receiver can't hold the water (200 g): small holds 75.4 mL to the brim, 200.4 mL asked for" in str(problem)
     warned: list[Problem] = []
-    plan = load_campaign(write(folder, "part.yaml", deployed + OBJECTIVES))
+    plan = load_campaign(write(folder, "part.yaml", deployed + OBJECTIVE))
     assert check_campaign(plan, warn=warned.append) == []
     assert "the receiver holds 75.4 mL, enough for what is asked for, not for the water (200 g)" in str(warned[0])
-    plan = load_campaign(write(folder, "much.yaml", deployed + OBJECTIVES.replace("50 mL", "90 mL")))
+    plan = load_campaign(write(folder, "much.yaml", deployed + OBJECTIVE.replace("50 mL", "90 mL")))
     (problem,) = check_campaign(plan)
     assert "receiver can't hold what is asked for: small holds 75.4 mL to the brim, 90 mL asked for" in str(problem)

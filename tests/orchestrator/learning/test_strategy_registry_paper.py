@@ -15,7 +15,6 @@ from actors.optimizer.questions import MinimumQuery, SuggestionQuery
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.cli.campaign_commands import run
 from orchestrator.learning.campaign_plan import CampaignPlan, DeploymentPlan
 from orchestrator.learning.deployment.d2 import RealOnly
 from orchestrator.learning.deployment.d3 import D3Settings, Hybrid
@@ -30,7 +29,6 @@ from orchestrator.study.study_page import tables
 from orchestrator.study.study_plan import StudyPlan, cells_of
 from orchestrator.study.study_runner import run_cell
 from orchestrator.study.study_statistics import gather
-from sim_engine.errors import DecantError
 from tests.support.campaign_files import CAMPAIGN, DEPLOYED, report, write
 from tests.support.study_files import read, written
 from tests.support.toy_spillage import calibration_spill, narrow_cup, narrow_cup_biased, weighed
@@ -106,14 +104,6 @@ def test_only_c4_averages(folder: Path) -> None:
     text = CAMPAIGN.replace("simulations: 20", "strategy: C2\n  samples: 5\n  averaging: noise")
     message = "calibration.averaging: belongs to C4, not to C2; remove it"
     assert message in report(write(folder, "campaign.yaml", text))
-
-
-def test_noise_makes_no_draws_of_theta_for_a_deployment_under_risk(folder: Path) -> None:
-    keys = "strategy: D1\n  risk: {theta: posterior}"
-    text = DEPLOYED.replace("strategy: D3", keys).replace("pours: 15", "pours: 1")
-    path = write(folder, "campaign.yaml", text.replace("simulations: 20", "simulations: 20\n  averaging: noise"))
-    with pytest.raises(DecantError, match="draws of θ, which no surrogate makes that takes actions for noise"):
-        run(path, in_process=True)
 
 
 # -- studies -----------------------------------------------------------------------------------------------------------

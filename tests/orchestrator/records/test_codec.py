@@ -15,26 +15,26 @@ from actors.optimizer.questions import (
     BenchOffset,
     CalibrationQuery,
     Data,
-    Disturbance,
     MinimumQuery,
     ModelDiscrepancy,
     OffsetPrior,
     PourQuery,
     RegressionQuery,
-    Risk,
-    RiskQuery,
     SpaceFillingQuery,
     Suggestion,
     SurrogateMap,
 )
+from orchestrator.learning.calibration.pour_design import DesignPoured
 from orchestrator.learning.requests import Failed, Pour, Poured, Prediction, Simulate, Simulated, Suggest, Suggested
 from orchestrator.records.codec import (
     CodecError,
     canonical,
     decode_outcome,
     decode_request,
+    decode_result,
     encode_outcome,
     encode_request,
+    encode_result,
     first_difference,
 )
 from sim_engine.action import ACTION_DIMENSIONS, Action
@@ -83,7 +83,6 @@ queries = st.one_of(
     st.builds(SpaceFillingQuery, **asked, known=points, count=st.integers(1, 9)),
     st.builds(RegressionQuery, **asked, data=data(), mean=st.sampled_from(["constant", "zero"])),
     st.builds(MinimumQuery, **proposed, plain=st.booleans()),
-    st.builds(RiskQuery, **proposed, risk=st.just(Risk((Disturbance((1.0, 1.0), (0.1, 0.0)),), 0.5))),
     st.builds(CalibrationQuery, **proposed, contexts=points),
     st.builds(PourQuery, **proposed, simulated=data(), discrepancy=st.none() | st.just(DISCREPANCY)),
 )
@@ -210,12 +209,24 @@ def test_the_first_difference_is_named() -> None:
         ({"points": [1.0, 2.5]}, ("points", 1), "points[1]: 2.0 became 2.5"),
         ({"action": {"x_offset": 0.2}}, ("action", "x_offset"), "action.x_offset: 0.1 became 0.2"),
         ({"action": {}}, ("action", "x_offset"), "action.x_offset: 0.1 became nothing"),
-        ({"new": None}, ("new",), "new: nothing became null"),
+        ({"new": {}}, ("new",), "new: nothing became {}"),
     ):
         difference = first_difference(old, {**old, **change})
         assert difference is not None
         assert (difference.path, str(difference)) == (path, text)
     assert str(first_difference([1], [1, 2])) == "value: [1] became [1, 2]"
+    assert first_difference(old, {**old, "new": None}) is None
+
+
+def test_empty_fields_of_an_earlier_version_are_ignored_and_others_are_refused() -> None:
+    answer = encode_outcome(Suggested(Suggestion(((0.5,),))))
+    answer["suggestion"] |= {"risk": None}
+    assert decode_outcome(answer) == Suggested(Suggestion(((0.5,),)))
+    result = DesignPoured(pours=())
+    assert decode_result({**encode_result(result), "risk": None, "objectives": []}) == result
+    answer["suggestion"]["risk"] = {"expected": [0.1]}
+    with pytest.raises(CodecError, match="Suggestion has no field risk"):
+        decode_outcome(answer)
 
 
 def test_a_request_of_a_version_without_drawn_shapes_is_read() -> None:

@@ -73,7 +73,7 @@ def wrong_in(data: Any) -> tuple[int, list[str]]:
 
 
 @pytest.fixture(
-    scope="module", params=["configs/campaigns/quickstart.yaml", "tests/golden/data/campaigns/objectives.yaml"]
+    scope="module", params=["configs/campaigns/quickstart.yaml", "tests/golden/data/campaigns/objective.yaml"]
 )
 def run(request: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[decant.Run, list[Event]]]:
     """A run in a world whose outcomes are formulas: some liquid is spilled, and some stays in the pourer."""

@@ -52,15 +52,14 @@ def everything_in(folder: Path) -> list[tuple[Path, int]]:
 
 
 def test_a_check_reports_all_problems_and_warnings_and_leaves_the_disk_as_it_was(tmp_path: Path) -> None:
-    risk = "  risk: {measure: cvar, level: 0.9, theta: posterior}\n"
-    only_d3 = "  prior_simulations: 4\n  pours: 2\n  simulations_per_pour: 2\n"
-    plan = campaign(tmp_path, ("[60 mm, 100 mm]", "[60 mm, 300 mm]"), ("strategy: D3", "strategy: D1"), (only_d3, risk))
-    without = replace(plan, calibration=None)
+    plan = campaign(tmp_path, ("[60 mm, 100 mm]", "[60 mm, 300 mm]"))
+    (tmp_path / "full").mkdir()
+    full = campaign(tmp_path / "full", ("mass: 100 g", "mass: 900 g"))
     before = everything_in(tmp_path)
-    report = RunService().check(run_task(without))
+    assert any("x_offset" in text for text in RunService().check(run_task(plan)).warnings)
+    report = RunService().check(run_task(full))
     assert everything_in(tmp_path) == before
-    assert any("x_offset" in text for text in report.warnings)
-    assert any("this campaign has no calibration" in text for text in report.problems)
+    assert any("holds" in text for text in report.problems)
     with pytest.raises(RunTaskError) as refused:
         report.require()
     assert str(refused.value) == "\n".join(report.problems)

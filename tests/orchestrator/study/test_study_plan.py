@@ -4,25 +4,18 @@ place.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import pytest
-from ruamel.yaml import YAML
 
 from orchestrator.campaigns.campaign_checks import touch
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.learning.calibration.pour_design import DesignPoured
-from orchestrator.learning.deployment.d1 import D1Settings, OneShotPlanning
-from orchestrator.learning.deployment.d2 import RealOnly
-from orchestrator.learning.deployment.d3 import Hybrid
 from orchestrator.study.study_campaigns import campaign_of
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_plan import cells_of, estimated_seconds
 from sim_engine.vessel.vessel import build_vessel
-from tests.support import plans
 from tests.support.study_files import ROOT, STUDIES, read, small, without, written
 
 
@@ -122,47 +115,6 @@ def test_without_levels_a_study_pours_on_its_laboratory_as_it_is(tmp_path: Path)
     study = load_study(written(tmp_path / "wired", wired))
     assert study.base.laboratory.arm is not None
     assert study.levels[0].bench == study.base.laboratory.bench, "an arm over wires needs its time"
-
-
-def risky(folder: Path, **strategy: Any) -> Path:
-    """The quick study of a campaign that plans under risk."""
-    campaign = YAML(typ="safe").load((ROOT / "configs/campaigns/quickstart.yaml").read_text(encoding="utf-8"))
-    for section, key in (("calibration", "receiver"), ("deployment", "receiver")):
-        campaign[section][key] = str((ROOT / "configs/campaigns" / campaign[section][key]).resolve())
-    for key in ("laboratory", "pourer"):
-        campaign[key] = str((ROOT / "configs/campaigns" / campaign[key]).resolve())
-    kept = {key: campaign["deployment"][key] for key in ("receiver", "motion", "actions")}
-    risk = {"measure": "expected", "pose_error": {"x": "3 mm"}, "theta": "posterior"}
-    campaign["deployment"] = {**kept, "strategy": "D1", "risk": risk}
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "campaign.yaml").write_text(json.dumps(campaign), encoding="utf-8")
-    data = read("quick")
-    data["deployment"]["D1"]["simulations_per_iteration"] = strategy.get("simulations_per_iteration", 2)
-    return written(folder, {**data, "campaign": str(folder / "campaign.yaml")})
-
-
-def test_risk_of_the_campaign_is_that_of_d1_and_what_simulates_draws_from_the_posterior(tmp_path: Path) -> None:
-    study = load_study(risky(tmp_path))
-    planned = study.deployment("D1-2").plan.settings
-    assert isinstance(planned, D1Settings)
-    assert planned.risk is not None
-    draws = [{"cohesion": 0.01 * i} for i in range(3)]
-    known = {"pours": DesignPoured(pours=()), "calibration": plans.calibrated(study.base.parameters, draws)}
-    made = {}
-    for cell in cells_of(study):
-        if cell.kind == "deployment" and cell.repetition == 1 and cell.level == "small":
-            request = campaign_of(study, cell, lambda name: known, tmp_path)
-            made[cell.strategy], plan = request.stages[0].build({}, 1), request.campaign
-            assert plan.deployment is not None
-            drawn = [one.cohesion for one in plan.deployment.thetas]
-            assert drawn == ([] if cell.strategy == "D2" else [0.0, 0.01, 0.02])  # D2 simulates nothing
-    assert {strategy: type(one) for strategy, one in made.items()} == {
-        "D1-2": OneShotPlanning,
-        "D2": RealOnly,
-        "D3": Hybrid,
-    }
-    with pytest.raises(ConfigError, match="at least 2 are needed"):
-        load_study(risky(tmp_path / "few", simulations_per_iteration=1))
 
 
 WRONG: dict[str, tuple[Any, str]] = {

@@ -120,7 +120,6 @@ def poured(strategy: str, rows: Sequence[tuple[Any, float]]) -> Deployed:
             predicted_deviation=None,
             predicted_scatter=None,
             loss=loss,
-            objectives={},
         )
         for number, (status, loss) in enumerate(rows, start=1)
     ]

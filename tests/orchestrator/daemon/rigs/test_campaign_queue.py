@@ -34,7 +34,6 @@ from orchestrator.daemon.state.access_tokens import Role
 from orchestrator.daemon.state.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.state.daemon_store import QueueItem
 from orchestrator.daemon.state.run_readout import Pours
-from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.reports.progress_state import CHECKPOINT_WORDS
 from orchestrator.runs.run_service import RunHandle, RunRequest
 from sim_engine.prediction_band import CalibrationResidual
@@ -245,30 +244,6 @@ def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_p
     run(work())
 
 
-RISKY = """  strategy: D1
-  risk: {measure: cvar, level: 0.9, theta: posterior, pose_error: {x: 3 mm}}
-"""
-
-
-def with_risk(folder: Path, **changes: str) -> CampaignPlan:
-    text = CAMPAIGN.replace("  strategy: D2\n", RISKY).replace("  pours: 3\n", "")
-    for old, new in changes.items():
-        text = text.replace(old, new)
-    path = folder / "risky.yaml"
-    write_campaign(folder, text)
-    (folder / "small.yaml").rename(path)
-    return load_campaign(path)
-
-
-def test_a_campaign_without_the_draws_of_theta_that_it_bears_is_refused_when_it_is_submitted(tmp_path: Path) -> None:
-    settings = DaemonSettings(tmp_path / "state", in_process=True)
-    text, files = pack(with_risk(tmp_path))
-    for verb, said in (("run", "this campaign has no calibration"), ("plan", "needs --parameters")):
-        with pytest.raises(SubmissionError, match=said):
-            prepare(settings, Submission(text=text, files=files, task=verb), "00000a", "somebody")
-    assert not any(settings.snapshots.iterdir())
-
-
 def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp_path: Path) -> None:
     theta = tmp_path / "theta.json"
     rows = [{"theta": {"friction": friction}, "weight": 1.0} for friction in (0.1, 0.3)]
@@ -279,7 +254,7 @@ def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp
     class Client:
         def submit(self, body: dict[str, Any]) -> dict[str, Any]:
             sent.append(body)
-            return {"id": "risky-1", "state": "queued", "rig": "none", "waits_for": ""}
+            return {"id": "small-1", "state": "queued", "rig": "none", "waits_for": ""}
 
     @contextlib.contextmanager
     def connected(url: Any, state: Any) -> Any:
@@ -287,7 +262,7 @@ def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("orchestrator.cli.queue_commands.connected_client", connected)
-        submit(with_risk(tmp_path).source, task="plan", parameters=theta, as_json=True)
+        submit(load_campaign(write_campaign(tmp_path, CAMPAIGN)).source, task="plan", parameters=theta, as_json=True)
     (body,) = sent
     settings = DaemonSettings(tmp_path / "state", in_process=True)
     submission = Submission(text=body["text"], files=body["files"], task="plan")

@@ -319,12 +319,8 @@ def test_rules_of_one_model_are_refused_with_another() -> None:
         def add(self, text: str, *at: Any, key: bool = False, of: str = "") -> None:
             self.at.append(at)
 
-    from orchestrator.learning.campaign_plan import Premises
-
     heard = Heard()
-    deployment_plan(model="residual", stop=StopSettings(), good_enough=0.01).settings.check(
-        Premises(None, False), heard
-    )
+    deployment_plan(model="residual", stop=StopSettings(), good_enough=0.01).settings.check(heard)
     assert heard.at == [("stop",), ("good_enough",)]
 
 

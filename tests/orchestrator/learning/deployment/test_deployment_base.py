@@ -238,7 +238,7 @@ def test_the_worst_loss_is_as_bad_as_spilling_or_keeping_everything(loss, worst)
     assert costing.worst == pytest.approx(worst)
     kept = PourMeasurement(loaded=0.2, spilled=0.0, retained=0.2)
     if loss.name == "normalised":  # undefined, and not pouring is not a solution
-        assert costing.poured(kept, SCENE.action({"angular_velocity": 1.0})) == (worst,)
+        assert costing.poured(kept, SCENE.action({"angular_velocity": 1.0})) == worst
 
 
 def test_an_answer_nobody_asked_for_is_refused():

@@ -1,4 +1,4 @@
-"""`objectives`: several objectives: what each is, and that not pouring never wins."""
+"""`objectives`: what each objective is, and that not pouring never wins."""
 
 from __future__ import annotations
 
@@ -14,15 +14,7 @@ from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.d1 import OneShotPlanning
 from orchestrator.learning.deployment.d2 import RealOnly
 from orchestrator.learning.deployment.d3 import Hybrid
-from orchestrator.learning.deployment.objectives import (
-    Objective,
-    Objectives,
-    Retained,
-    Spilled,
-    TargetVolume,
-    Time,
-    duration,
-)
+from orchestrator.learning.deployment.objectives import Objective, Retained, Spilled, TargetVolume, Time, duration
 from orchestrator.learning.requests import Outcome, Poured, Request, Simulate, Simulated, Suggest
 from orchestrator.runs.strategy_harness import SCENE, THETA, StrategyHarness, outcome_of
 from sim_engine.action import DEG, Action
@@ -44,17 +36,7 @@ LITRE = 1e-3
 SPILLED, RETAINED, TIME = Spilled(), Retained(), Time(scale=8.0)
 TARGET = TargetVolume(volume=0.12 * LITRE, tolerance=0.002 * LITRE)
 
-SETS = {
-    "spilled": (SPILLED,),
-    "retained": (RETAINED,),
-    "time": (TIME,),
-    "spilled and time": (SPILLED, TIME),
-    "spilled and retained": (SPILLED, RETAINED),
-    "all of the load": (SPILLED, RETAINED, TIME),
-    "a volume": (TARGET,),
-    "a volume, quickly": (TARGET, TIME.model_copy(update={"weight": 0.3})),
-    "hurry above all": (SPILLED.model_copy(update={"weight": 0.01}), TIME.model_copy(update={"weight": 100.0})),
-}
+OBJECTIVES: dict[str, Objective] = {"spilled": SPILLED, "retained": RETAINED, "time": TIME, "a volume": TARGET}
 
 
 def world(action: Action) -> Fractions:
@@ -79,9 +61,8 @@ def answers(request: Request) -> Outcome | None:
     return Poured(PourMeasurement(loaded=0.2, spilled=0.2 * spilled, retained=0.2 * retained))
 
 
-def make(name: str, parts: tuple[Objective, ...], seed: int = 0, **changes: Any) -> Any:
-    objectives = Objectives(parts)
-    values: dict[str, Any] = {"actions": ACTIONS, "objectives": objectives, "pours": 8, "prior_simulations": 20}
+def make(name: str, objective: Objective, seed: int = 0, **changes: Any) -> Any:
+    values: dict[str, Any] = {"actions": ACTIONS, "objective": objective, "pours": 8, "prior_simulations": 20}
     plan = deployment_plan(strategy=name, **(values | changes))
     return STRATEGIES[name](plan, SCENE, THETA, seed)
 
@@ -94,12 +75,12 @@ def delivered(fractions: Fractions) -> float:
     return fractions.poured - fractions.spilled
 
 
-def wanted(parts: tuple[Objective, ...]) -> float:
-    return TARGET.volume / SCENE.liquid.volume if TARGET in parts else 1.0
+def wanted(objective: Objective) -> float:
+    return TARGET.volume / SCENE.liquid.volume if objective is TARGET else 1.0
 
 
-def costing(parts: tuple[Objective, ...], floor: float = 0.5) -> Costing:
-    return Costing(Loss(), SCENE, THETA, (Objectives(parts, floor), ACTIONS))
+def costing(objective: Objective, floor: float = 0.5) -> Costing:
+    return Costing(Loss(), SCENE, THETA, (objective.model_copy(update={"floor": floor}), ACTIONS))
 
 
 def grid() -> list[Action]:
@@ -109,7 +90,7 @@ def grid() -> list[Action]:
 
 def cost(judge: Costing, action: Action) -> float:
     truth = world(action)
-    return judge.total(judge.poured(PourMeasurement(1.0, truth.spilled, truth.retained), action))
+    return judge.poured(PourMeasurement(1.0, truth.spilled, truth.retained), action)
 
 
 # -- each objective ------------------------------------------------------------------------------------------------
@@ -119,7 +100,7 @@ def test_objectives_have_no_good_action_that_simulations_go_on_for() -> None:
     def all_spilled(request: Request) -> Outcome | None:
         return Simulated(outcome_of(0.95, seed=request.seed)) if isinstance(request, Simulate) else answers(request)
 
-    strategy = make("D3", (SPILLED,), pours=1, prior_simulations=9, simulations_per_pour=0, model="adaptive")
+    strategy = make("D3", SPILLED, pours=1, prior_simulations=9, simulations_per_pour=0, model="adaptive")
     StrategyHarness(lambda *_: 0.0, answer=all_spilled).run(strategy)
     assert len(strategy.result().simulated) == 9
 
@@ -134,13 +115,13 @@ def test_the_duration_of_an_action_is_that_of_the_motion_which_is_made() -> None
 
 
 def test_a_missed_volume_costs_beyond_its_tolerance_on_either_side() -> None:
-    objectives, action = Objectives((TARGET,)), SCENE.action(ACTIONS.decode([0.5, 0.5, 0.5]))
+    action = SCENE.action(ACTIONS.decode([0.5, 0.5, 0.5]))
     loaded = SCENE.liquid.volume
-    worst = objectives.worst(SCENE, ACTIONS)
+    worst = TARGET.worst(SCENE, ACTIONS)
 
     def missed(volume: float, spilled: float = 0.0) -> float:
         poured = volume / loaded
-        return objectives.vector(Fractions(poured, spilled, 1.0 - poured), action, SCENE, worst)[0]
+        return TARGET.bounded_cost(Fractions(poured, spilled, 1.0 - poured), action, SCENE, worst)
 
     assert missed(0.120 * LITRE) == missed(0.1215 * LITRE) == missed(0.1185 * LITRE) == 0.0
     assert missed(0.132 * LITRE) == pytest.approx(0.010 * LITRE / loaded)
@@ -151,9 +132,9 @@ def test_a_missed_volume_costs_beyond_its_tolerance_on_either_side() -> None:
 # -- not pouring is not a solution ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("name", OBJECTIVES)
 def test_every_pour_that_delivers_enough_beats_every_one_that_does_not(name: str) -> None:
-    judge, least = costing(SETS[name]), 0.5 * wanted(SETS[name])
+    judge, least = costing(OBJECTIVES[name]), 0.5 * wanted(OBJECTIVES[name])
     rng = np.random.default_rng(1)
     good, bad = [], []
     for _ in range(4000):
@@ -161,42 +142,41 @@ def test_every_pour_that_delivers_enough_beats_every_one_that_does_not(name: str
         fractions = Fractions(poured, poured * rng.random(), 1.0 - poured)
         action = SCENE.action(ACTIONS.draw(rng))
         measured = PourMeasurement(1.0, fractions.spilled, fractions.retained)
-        vector = judge.poured(measured, action)
-        (good if delivered(fractions) >= least + 1e-9 else bad).append(vector)
-        assert judge.total(vector) <= judge.worst + 1e-9
+        value = judge.poured(measured, action)
+        (good if delivered(fractions) >= least + 1e-9 else bad).append(value)
+        assert value <= judge.worst + 1e-9
     assert min(len(good), len(bad)) > 500
-    assert np.all(np.max(good, axis=0) <= np.min(bad, axis=0))
-    assert max(map(judge.total, good)) < min(map(judge.total, bad))
+    assert max(good) < min(bad)
 
 
-@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("name", OBJECTIVES)
 def test_the_best_action_of_the_toy_world_pours_and_without_a_floor_often_would_not(name: str) -> None:
-    parts = SETS[name]
-    best = min(grid(), key=lambda action: cost(costing(parts), action))
-    assert delivered(world(best)) >= 0.5 * wanted(parts)
-    without = min(grid(), key=lambda action: cost(costing(parts, floor=1e-9), action))
-    if name in ("spilled", "time", "spilled and time", "hurry above all"):
+    objective = OBJECTIVES[name]
+    best = min(grid(), key=lambda action: cost(costing(objective), action))
+    assert delivered(world(best)) >= 0.5 * wanted(objective)
+    without = min(grid(), key=lambda action: cost(costing(objective, floor=1e-9), action))
+    if name in ("spilled", "time"):
         assert delivered(world(without)) < 0.4
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("strategy", STRATEGIES)
-@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("name", OBJECTIVES)
 def test_no_strategy_recommends_to_pour_too_little(name: str, strategy: str) -> None:
-    parts = SETS[name]
-    found = make(strategy, parts, 2, pours=12 if strategy == "D2" else 4, iterations=14)
+    objective = OBJECTIVES[name]
+    found = make(strategy, objective, 2, pours=12 if strategy == "D2" else 4, iterations=14)
     play(found)
     action = SCENE.action(found.best_values)
-    assert delivered(world(action)) > 0.45 * wanted(parts)
+    assert delivered(world(action)) > 0.45 * wanted(objective)
     rng = np.random.default_rng(0)
-    drawn = [cost(costing(parts), SCENE.action(ACTIONS.draw(rng))) for _ in range(200)]
-    assert cost(costing(parts), action) < np.median(drawn)
+    drawn = [cost(costing(objective), SCENE.action(ACTIONS.draw(rng))) for _ in range(200)]
+    assert cost(costing(objective), action) < np.median(drawn)
 
 
 def test_a_planned_pour_stops_at_the_wanted_volume() -> None:
     missed = []
     for seed in range(2):
-        planned = make("D1", (TARGET,), seed, pours=0, iterations=24)
+        planned = make("D1", TARGET, seed, pours=0, iterations=24)
         play(planned)
         poured = world(SCENE.action(planned.best_values)).poured * SCENE.liquid.volume
         missed.append(abs(poured - TARGET.volume))
