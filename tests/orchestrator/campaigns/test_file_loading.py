@@ -81,29 +81,6 @@ def test_all_errors_of_a_file_and_of_what_it_names_come_at_once(
 
 
 @pytest.mark.parametrize(
-    ("written", "message"),
-    [
-        ("surface_tension: 72", "72 has no unit; write '72 mN/m' if that is what is meant"),
-        ("surface_tension: 72 N/m", "72 N/m is outside 1 … 1000 mN/m"),
-        (
-            "viscosity: 1 mN/m",
-            "'1 mN/m' is a surface tension; should be a dynamic viscosity, for example '1 mPa*s'",
-        ),
-        ("viscosity: 0 mPa*s", "0 mPa*s is outside 0.01 … 1e+06 mPa*s"),
-        ("dynamic_viscosity: 1 mPa*s", "liquid.dynamic_viscosity: unknown key; did you mean 'viscosity'?"),
-        ("temperature: 25", "25 has no unit; write '25 degC' if that is what is meant"),
-        ("temperature: 98 degC", "water is known from 0 to 95 °C, not at 98 °C"),
-    ],
-)
-def test_a_liquid_s_properties_are_checked_like_all_quantities(written: str, message: str, tmp_path: Path) -> None:
-    text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8")
-    (tmp_path / "campaign.yaml").write_text(text.replace("mass: 200 g", f"mass: 200 g, {written}"), encoding="utf-8")
-    with pytest.raises(ConfigError) as caught:
-        load_campaign(tmp_path / "campaign.yaml")
-    assert message in str(caught.value)
-
-
-@pytest.mark.parametrize(
     ("name", "message"),
     [
         ("glycerin 80 %", "'glycerin 80 %' is not in the table of liquids. Did you mean 'glycerol 80 %'?"),

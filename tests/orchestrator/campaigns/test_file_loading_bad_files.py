@@ -1,6 +1,4 @@
-"""`file_loading`: bad vessels, parameters, laboratories and values of the command line, and campaigns that no
-vessel can serve.
-"""
+"""`file_loading`: bad meshes and values of the command line, and campaigns that no vessel can serve."""
 
 from __future__ import annotations
 
@@ -11,40 +9,9 @@ import pytest
 
 from orchestrator.campaigns.action_assignments import AssignmentError, set_action
 from orchestrator.campaigns.campaign_checks import check_campaign
-from orchestrator.campaigns.file_loading import load_campaign, load_laboratory, load_parameters, load_vessel
+from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from tests.support.campaign_files import CAMPAIGN, DEPLOYED, LABORATORY, VESSEL, write
-
-BAD_VESSELS = {
-    "no shape": ("name: cup\n", "vessel.yaml:1:1: has no shape; add 'profile:'"),
-    "rim below": (VESSEL.replace("[40, 100]", "[40, 0.0]"), "inner[2]: "),
-    "off the axis": (
-        VESSEL.replace("[[0, 0]", "[[1, 0]"),
-        "4:11: profile.inner[0]: the first point is the inner floor",
-    ),
-    "implausible size": (
-        VESSEL.replace("unit: mm", "unit: m"),
-        "profile.unit: in m the vessel would be 100000 mm large",
-    ),
-    "bare wall": (VESSEL.replace("wall: 4 mm", "wall: 4"), "5:9: profile.wall: 4 has no unit; write '4 mm'"),
-    "point in space": (VESSEL.replace("[40, 100]", "[40, 0, 100]"), "profile.inner[2]: has 3 items; should have 2"),
-    "mesh of another kind": ("name: mug\nmesh: mug.step\n", "2:7: mesh: .step is not a mesh; use STL, OBJ, PLY or GLB"),
-    "mesh that is not there": ("name: mug\nmesh: mug.stl\n", "2:7: mesh: no such file: "),
-    "two shapes": (VESSEL + "mesh: mug.stl\n", "7:1: mesh: the vessel has a profile already"),
-    "too few deviations": (
-        VESSEL.rstrip() + "\n  radius_deviations: [[0, 1, 1], [0, 1]]\n",
-        "7:34: profile.radius_deviations[1]: has 2 number(s); should have one for each of the 3 points of 'inner'",
-    ),
-    "unknown unit": (VESSEL.replace("unit: mm", "unit: feet"), "profile.unit: 'feet' is not known here; should be"),
-}
-
-
-@pytest.mark.parametrize("case", BAD_VESSELS, ids=lambda case: case.replace(" ", "-"))
-def test_bad_vessel_is_refused_with(case: str, folder: Path) -> None:
-    text, expected = BAD_VESSELS[case]
-    with pytest.raises(ConfigError) as caught:
-        load_vessel(write(folder, "vessel.yaml", text))
-    assert expected in str(caught.value)
 
 
 def test_bad_mesh_is_refused_by_the_check_with_its_file(folder: Path) -> None:
@@ -114,23 +81,6 @@ def test_bad_value_on_the_command_line_is_refused_with(case: str) -> None:
 def test_dimension_missing_on_the_command_line_is_named() -> None:
     with pytest.raises(AssignmentError, match=r"x_offset has no value; add for example --set x_offset=90"):
         set_action(["angular_velocity=40", "height=90"])
-
-
-BAD_PARAMETERS = {
-    "unknown parameter": ('{"theta": {"cohesin": 0.1}}', "theta.cohesin: unknown key; did you mean 'cohesion'?"),
-    "out of bounds": ("particles: 3", "1:12: particles: 3 is outside 200 … 50000"),
-    "broken number": ("particles: 1500.5", "particles: 1500.5 should be a whole number"),
-    "nothing known": ("{}", "names no parameter; known are particles, cohesion"),
-    "another unit": ("xsph_rate: 3 mm", "xsph_rate: '3 mm' is a length; should be a rate"),
-}
-
-
-@pytest.mark.parametrize("case", BAD_PARAMETERS, ids=lambda case: case.replace(" ", "-"))
-def test_bad_parameter_file_is_refused_with(case: str, folder: Path) -> None:
-    text, expected = BAD_PARAMETERS[case]
-    with pytest.raises(ConfigError) as caught:
-        load_parameters(write(folder, "theta.json", text))
-    assert expected in str(caught.value)
 
 
 def test_bad_laboratory_is_refused_with_its_place(folder: Path) -> None:

@@ -81,56 +81,6 @@ def test_a_laboratory_as_written_out_loads_to_the_same(tmp_path, text):
     assert load(tmp_path, written_out(LaboratorySettings, text)) == spec
 
 
-BENCH = "bench:\n  liquid: {particles: 4000}\n  time_scale: 30\n"
-
-CASES = {
-    "virtual operator on hardware": (
-        changed(HARDWARE, ("answers: person", "answers: virtual")),
-        r"operator.answers: where an arm moves, a person has to say",
-    ),
-    "operator's time on hardware": (
-        changed(HARDWARE, ("answers: person", "answers: person\n  time: 85 s")),
-        r"operator.time: is a virtual operator's",
-    ),
-    "scaled time on hardware": (HARDWARE + BENCH, r"bench: is what a virtual bench hides, and how fast its time runs"),
-    "hardware without an arm": (without(without(without(without(HARDWARE, "arm"), "cell"), "balance"), "operator"),
-                                r"a laboratory of hardware needs its arm"),
-    "virtual arm without a hidden liquid": (without(VIRTUAL, "bench"), r"a virtual arm needs the true parameters"),
-    "arm without a balance": (without(VIRTUAL, "balance"), r"an arm that pours needs a balance"),
-    "arm without a cell": (without(VIRTUAL, "cell"), r"add 'cell:"),
-    "an arm that is faster than it is told": (
-        changed(VIRTUAL, ("tilt: 0.5 deg}", "tilt: 0.5 deg, speed_factor: 1.02}")),
-        r"bench.pose_error.speed_factor: an arm over its wires moves as fast as it is told",
-    ),
-    "… or scatters": (
-        changed(VIRTUAL, ("tilt: 0.3 deg}", "tilt: 0.3 deg, speed_factor: 0.01}")),
-        r"bench.pose_noise.speed_factor: an arm over its wires",
-    ),
-    "time that waits for nothing": (changed(VIRTUAL, ("time_scale: 30", "time_scale: 0")), r"an arm takes its time"),
-    "a bench of numbers' balance": (
-        changed(VIRTUAL, ("  time_scale: 30", "  balance: {noise: 0.1 g}\n  time_scale: 30")),
-        r"bench.balance: is of a bench without wires",
-    ),
-    "a bench of numbers with an operator": (TWIN + "operator: {time: 85 s}\n", r"operator: belongs to an arm"),
-    "a cell without an arm": (
-        TWIN + "cell: {receiver: {x: 1 m, y: 0 m, z: 0 m}, direction: 90 deg}\n",
-        r"cell: belongs to an arm",
-    ),
-    "a port on a virtual bench": (
-        changed(VIRTUAL, ("  repeatability", "  port: /dev/ttyUSB0\n  repeatability")),
-        r"balance.virtual: a balance has a 'port' or is 'virtual'",
-    ),
-    "a reminder after the deadline": (changed(HARDWARE, ("reminder: 2 min", "reminder: 1 h")), r"operator.reminder: "),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("text", "message"), CASES.values(), ids=CASES.keys())
-def test_what_does_not_fit_together_is_refused_with_its_place(tmp_path, text, message):
-    with pytest.raises(ConfigError, match=message) as error:
-        load(tmp_path, text)
-    assert len(error.value.problems) == 1, str(error.value)
-
-
 def quickstart(laboratory: Path) -> CampaignPlan:
     text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8")
     path = laboratory.parent / "campaign.yaml"
