@@ -73,22 +73,18 @@ def test_a_question_that_makes_no_sense_is_an_error_that_says_so(fake):
 
 @pytest.mark.realtime
 @pytest.mark.ray
-def test_optimiser_and_its_twin_propose_the_same_also_after_a_death(ray_running, fake):
-    async def play():
-        async with laboratory(True, fake) as opened:
-            twin = await opened.optimizer.suggest(PROBLEM)
-        async with laboratory(False, fake) as opened:
-            victim = await opened.optimizer.device.pid()
-            first = asyncio.create_task(opened.optimizer.suggest(PROBLEM))
-            await asyncio.sleep(0.02)  # the query is under way, and takes longer than this
-            os.kill(victim, signal.SIGKILL)
-            with pytest.raises(DeviceLostError):
-                await first
-            answer = await opened.optimizer.suggest(PROBLEM)
-            assert await opened.optimizer.device.pid() != victim
-        return twin, answer
-
-    twin, answer = asyncio.run(play())
+async def test_optimiser_and_its_twin_propose_the_same_also_after_a_death(ray_running, fake):
+    async with laboratory(True, fake) as opened:
+        twin = await opened.optimizer.suggest(PROBLEM)
+    async with laboratory(False, fake) as opened:
+        victim = await opened.optimizer.device.pid()
+        first = asyncio.create_task(opened.optimizer.suggest(PROBLEM))
+        await asyncio.sleep(0.02)  # the query is under way, and takes longer than this
+        os.kill(victim, signal.SIGKILL)
+        with pytest.raises(DeviceLostError):
+            await first
+        answer = await opened.optimizer.suggest(PROBLEM)
+        assert await opened.optimizer.device.pid() != victim
     assert len(answer.points) == 2
     for ours, theirs in zip(answer.points, twin.points, strict=True):
         assert ours == pytest.approx(theirs, abs=1e-6)

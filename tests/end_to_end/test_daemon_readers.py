@@ -81,7 +81,7 @@ def test_a_reader_that_never_reads_costs_nothing_and_holds_nobody_up(real: Real)
 
 
 @pytest.mark.slow
-def test_two_hundred_read_at_once_and_a_stop_is_heard_all_the_same(real: Real) -> None:
+async def test_two_hundred_read_at_once_and_a_stop_is_heard_all_the_same(real: Real) -> None:
     import httpx
 
     count = 200
@@ -95,18 +95,15 @@ def test_two_hundred_read_at_once_and_a_stop_is_heard_all_the_same(real: Real) -
                     if got[number] == 60:
                         return
 
-    async def work() -> None:
-        headers = {"Authorization": f"Bearer {real.token()}"}
-        limits = httpx.Limits(max_connections=None)
-        async with httpx.AsyncClient(headers=headers, limits=limits, timeout=PATIENCE, trust_env=False) as client:
-            readers = [asyncio.create_task(read(client, number)) for number in range(count)]
-            while real.daemon.shared.feed.readers < count:
-                await asyncio.sleep(0.02)
-            await asyncio.to_thread(real.tell, 30)
-            stopped = await client.post(f"{real.url}/api/v1/emergency-stop", json={})
-            assert stopped.json()["emergency"]["by"] == "viewer"
-            await asyncio.to_thread(real.tell, 40)
-            await asyncio.gather(*readers)
-
-    asyncio.run(work())
+    headers = {"Authorization": f"Bearer {real.token()}"}
+    limits = httpx.Limits(max_connections=None)
+    async with httpx.AsyncClient(headers=headers, limits=limits, timeout=PATIENCE, trust_env=False) as client:
+        readers = [asyncio.create_task(read(client, number)) for number in range(count)]
+        while real.daemon.shared.feed.readers < count:
+            await asyncio.sleep(0.02)
+        await asyncio.to_thread(real.tell, 30)
+        stopped = await client.post(f"{real.url}/api/v1/emergency-stop", json={})
+        assert stopped.json()["emergency"]["by"] == "viewer"
+        await asyncio.to_thread(real.tell, 40)
+        await asyncio.gather(*readers)
     assert got == [60] * count

@@ -91,30 +91,27 @@ def make_arm(request):
 
 
 @pytest.mark.realtime
-def test_stop_ends_a_motion_under_way_and_holds_until_released(make_arm, path, motion):
-    async def play():
-        arm = make_arm(SimulatedArmSettings(time_scale=0.2))
-        await arm.release()
-        pouring = asyncio.create_task(arm.execute(path, lambda state: None))
-        async with asyncio.timeout(PATIENCE):
-            while not (await arm.state()).moving or (await arm.state()).time < 0.1:
-                await asyncio.sleep(0.02)
-        await arm.stop()
-        with pytest.raises(ArmStoppedError) as stopped:
-            await pouring
-        with pytest.raises(ArmNotReleasedError, match="release"):
-            await arm.execute(path, lambda state: None)
-        await arm.release()
-        going = asyncio.create_task(arm.move_to_start(path))
-        while not (moving := await arm.state()).moving:
+async def test_stop_ends_a_motion_under_way_and_holds_until_released(make_arm, path, motion):
+    arm = make_arm(SimulatedArmSettings(time_scale=0.2))
+    await arm.release()
+    pouring = asyncio.create_task(arm.execute(path, lambda state: None))
+    async with asyncio.timeout(PATIENCE):
+        while not (await arm.state()).moving or (await arm.state()).time < 0.1:
             await asyncio.sleep(0.02)
-        await arm.stop()
-        with pytest.raises(ArmStoppedError, match="during approach"):
-            await going
-        await arm.device.close()
-        return stopped.value.executed, moving
-
-    executed, moving = asyncio.run(play())
+    await arm.stop()
+    with pytest.raises(ArmStoppedError) as stopped:
+        await pouring
+    with pytest.raises(ArmNotReleasedError, match="release"):
+        await arm.execute(path, lambda state: None)
+    await arm.release()
+    going = asyncio.create_task(arm.move_to_start(path))
+    while not (moving := await arm.state()).moving:
+        await asyncio.sleep(0.02)
+    await arm.stop()
+    with pytest.raises(ArmStoppedError, match="during approach"):
+        await going
+    await arm.device.close()
+    executed = stopped.value.executed
     assert not executed.completed
     assert 0.05 < executed.times[-1] < 1.5 < motion.duration
     assert moving.moving
@@ -122,16 +119,12 @@ def test_stop_ends_a_motion_under_way_and_holds_until_released(make_arm, path, m
 
 
 @pytest.mark.realtime
-def test_progress_follows_the_tilt_through_the_phases(make_arm, path, motion):
+async def test_progress_follows_the_tilt_through_the_phases(make_arm, path, motion):
     seen = []
-
-    async def play():
-        arm = make_arm(SimulatedArmSettings(time_scale=2.0))
-        await arm.release()
-        await arm.execute(path, seen.append)
-        await arm.device.close()
-
-    asyncio.run(play())
+    arm = make_arm(SimulatedArmSettings(time_scale=2.0))
+    await arm.release()
+    await arm.execute(path, seen.append)
+    await arm.device.close()
     moving = [state for state in seen if state.moving]
     assert len(moving) >= 5
     assert [s.fraction for s in moving] == sorted(s.fraction for s in moving)

@@ -94,27 +94,22 @@ def test_the_display_is_read_five_to_ten_times_a_second(driver):
 
 
 @pytest.mark.realtime
-def test_behind_its_device_it_is_a_balance_like_any_other(driver):
+async def test_behind_its_device_it_is_a_balance_like_any_other(driver):
     far, balance = driver("mt-sics")
     far.put(0.35)
-
-    async def play():
-        device = LocalDevice("balance", lambda: balance)
-        behind = DeviceBalance(device, longest_call=30.0)
-        assert "MT-SICS" in await behind.connect()
-        await behind.tare()
-        far.put(0.3512)
-        weight = await behind.weigh()
-        shown = [w async for w in _first(behind.stream(0.05), 3)]
-        await behind.interrupt()
-        with pytest.raises(BalanceError, match="interrupted"):
-            await behind.weigh()
-        counts = await behind.statistics()
-        await behind.release()
-        await device.close()
-        return weight, shown, counts
-
-    weight, shown, counts = asyncio.run(play())
+    device = LocalDevice("balance", lambda: balance)
+    behind = DeviceBalance(device, longest_call=30.0)
+    assert "MT-SICS" in await behind.connect()
+    await behind.tare()
+    far.put(0.3512)
+    weight = await behind.weigh()
+    shown = [w async for w in _first(behind.stream(0.05), 3)]
+    await behind.interrupt()
+    with pytest.raises(BalanceError, match="interrupted"):
+        await behind.weigh()
+    counts = await behind.statistics()
+    await behind.release()
+    await device.close()
     assert weight.mass == pytest.approx(0.0012, abs=1e-9)
     assert [w.shown for w in shown] == ["1.2 g"] * 3
     assert counts["lines"] > 5

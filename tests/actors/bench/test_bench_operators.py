@@ -149,7 +149,7 @@ def test_a_question_that_nobody_answers_is_repeated_and_then_given_up():
     assert questions.take_log()[0]["about"] == "tray_wiped"
 
 
-def test_a_person_can_play_on_a_virtual_bench_and_reads_weights_off_the_question():
+async def test_a_person_can_play_on_a_virtual_bench_and_reads_weights_off_the_question():
     put: list[float] = []
 
     async def onto(mass: float) -> None:
@@ -160,16 +160,13 @@ def test_a_person_can_play_on_a_virtual_bench_and_reads_weights_off_the_question
             await super().ask(question)
             return question.text.split("shows ")[1].rstrip(".)") if question.wants == "weight" else "done"
 
-    async def play() -> tuple[BenchContents, str]:
-        contents = BenchContents(Placement.TRAY)
-        hands = Hands(contents, onto)
-        hands.prepare(0.2, (1,))
-        played = PlayedOperator(Reader(0.0), hands)
-        await played.ask(OperatorQuestion("Wipe the tray.", "done", about="tray_wiped"))
-        await played.ask(OperatorQuestion("Fill the pourer.", "done", about="pourer_full"))
-        return contents, await played.ask(OperatorQuestion("Weigh the tray.", "weight", about="tray_before"))
-
-    contents, typed = asyncio.run(play())
+    contents = BenchContents(Placement.TRAY)
+    hands = Hands(contents, onto)
+    hands.prepare(0.2, (1,))
+    played = PlayedOperator(Reader(0.0), hands)
+    await played.ask(OperatorQuestion("Wipe the tray.", "done", about="tray_wiped"))
+    await played.ask(OperatorQuestion("Fill the pourer.", "done", about="pourer_full"))
+    typed = await played.ask(OperatorQuestion("Weigh the tray.", "weight", about="tray_before"))
     assert put == [pytest.approx(TRAY), pytest.approx(TRAY + POURER + 0.2, abs=5e-3)]
     assert typed == f"{1e3 * TRAY:.1f} g"
     assert contents.in_pourer == pytest.approx(0.2, abs=5e-3)

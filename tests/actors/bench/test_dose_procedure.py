@@ -106,118 +106,100 @@ def check_amount(stage: Stage, measured: PourMeasurement, grams: float, held: fl
 
 
 @pytest.mark.slow
-def test_a_short_series_is_poured_over_the_wires(open_stage: OpenStage) -> None:
-    async def scenario() -> None:
-        planned = tuple(PlannedDose(amount, 1e-3, SCENE.receiver.name) for amount in (0.025, 0.01))
-        scene = replace(SCENE, fixed=ACTION.values())
-        strategy = Dispense(DispensePlan((scene,), planned, 0.0, False, "wires"), seed=3)
-        seen: list[PourProgress] = []
-        async with open_stage(dosing_spec()) as stage:
-            while not strategy.finished:
-                (request,) = strategy.ask(Slots(0))
-                assert isinstance(request, Pour)
-                assert request.dose is not None
-                seen.clear()
-                measured = await stage.bench.pour(
-                    scene, request.action, seed=request.seed, progress=seen.append, dose=request.dose
-                )
-                held = request.dose.source.mass if request.dose.source is not None else 0.0
-                check_amount(stage, measured, 1e3 * request.dose.amount, held)
-                doses = [one.dose for one in seen if one.dose is not None]
-                assert {one.phase for one in doses} >= {"approach", "settle"}
-                assert max(one.flow for one in doses) > 1e-3
-                assert doses[-1].reading == pytest.approx(measured.notes["dose"]["received"], abs=3e-4)
-                strategy.tell(request, Poured(measured))
-            # filled once; a receiver for each dose
-            first, second = ["dose_source", "dose_receiver", "start"], ["dose_cleared", "dose_receiver", "start"]
-            assert stage.heard == first + second
-            assert not stage.unsafe
-        poured = strategy.result().doses
-        assert [dose.filled for dose in poured] == [True, False]
-        received = math.fsum(dose.received_g or 0.0 for dose in poured)
-        assert poured[-1].left_g == pytest.approx(350.0 - received, abs=5.0)
-
-    asyncio.run(scenario())
+async def test_a_short_series_is_poured_over_the_wires(open_stage: OpenStage) -> None:
+    planned = tuple(PlannedDose(amount, 1e-3, SCENE.receiver.name) for amount in (0.025, 0.01))
+    scene = replace(SCENE, fixed=ACTION.values())
+    strategy = Dispense(DispensePlan((scene,), planned, 0.0, False, "wires"), seed=3)
+    seen: list[PourProgress] = []
+    async with open_stage(dosing_spec()) as stage:
+        while not strategy.finished:
+            (request,) = strategy.ask(Slots(0))
+            assert isinstance(request, Pour)
+            assert request.dose is not None
+            seen.clear()
+            measured = await stage.bench.pour(
+                scene, request.action, seed=request.seed, progress=seen.append, dose=request.dose
+            )
+            held = request.dose.source.mass if request.dose.source is not None else 0.0
+            check_amount(stage, measured, 1e3 * request.dose.amount, held)
+            doses = [one.dose for one in seen if one.dose is not None]
+            assert {one.phase for one in doses} >= {"approach", "settle"}
+            assert max(one.flow for one in doses) > 1e-3
+            assert doses[-1].reading == pytest.approx(measured.notes["dose"]["received"], abs=3e-4)
+            strategy.tell(request, Poured(measured))
+        # filled once; a receiver for each dose
+        first, second = ["dose_source", "dose_receiver", "start"], ["dose_cleared", "dose_receiver", "start"]
+        assert stage.heard == first + second
+        assert not stage.unsafe
+    poured = strategy.result().doses
+    assert [dose.filled for dose in poured] == [True, False]
+    received = math.fsum(dose.received_g or 0.0 for dose in poured)
+    assert poured[-1].left_g == pytest.approx(350.0 - received, abs=5.0)
 
 
 @pytest.mark.slow
-def test_a_mixture_is_poured_from_two_sources_into_a_cup_that_comes_back(open_stage: OpenStage) -> None:
-    async def scenario() -> None:
-        series = mixtures.plan({"water": 25.0, "oil": 15.0})
-        strategy = Mix(series, 3)
-        async with open_stage(dosing_spec()) as stage:
-            texts: list[str] = []
-            while not strategy.finished:
-                pour, dose = mixtures.asked(strategy)
-                scene = replace(SCENE, liquid=Liquid(mass=0.3, density=mixtures.DENSITIES[dose.source.name[7:]]))
-                measured = await stage.bench.pour(scene, ACTION, seed=pour.seed, dose=dose)
-                texts += [question.text for question in stage.operator.heard]
-                assert 1e3 * measured.notes["dose"]["received"] == pytest.approx(1e3 * dose.amount, abs=4.0)
-                strategy.tell(pour, Poured(measured))
-            held = {name: round(1e3 * mass) for name, mass in stage.contents.liquids.items() if "/" in name}
-        poured = {dose.liquid: dose.received_g for dose in strategy.result().doses}
-        assert held["rack/A1"] == pytest.approx(sum(mass or 0.0 for mass in poured.values()), abs=1.5)
-        assert held["source/water"] == pytest.approx(300.0 - (poured["water"] or 0.0), abs=4.0)
-        assert any(text.startswith("Put the empty receiver rack/A1 on the balance") for text in texts)
-        assert any(re.match(r"Put the receiver rack/A1, which holds 1\d g, on the balance", text) for text in texts)
-
-    asyncio.run(scenario())
+async def test_a_mixture_is_poured_from_two_sources_into_a_cup_that_comes_back(open_stage: OpenStage) -> None:
+    series = mixtures.plan({"water": 25.0, "oil": 15.0})
+    strategy = Mix(series, 3)
+    async with open_stage(dosing_spec()) as stage:
+        texts: list[str] = []
+        while not strategy.finished:
+            pour, dose = mixtures.asked(strategy)
+            scene = replace(SCENE, liquid=Liquid(mass=0.3, density=mixtures.DENSITIES[dose.source.name[7:]]))
+            measured = await stage.bench.pour(scene, ACTION, seed=pour.seed, dose=dose)
+            texts += [question.text for question in stage.operator.heard]
+            assert 1e3 * measured.notes["dose"]["received"] == pytest.approx(1e3 * dose.amount, abs=4.0)
+            strategy.tell(pour, Poured(measured))
+        held = {name: round(1e3 * mass) for name, mass in stage.contents.liquids.items() if "/" in name}
+    poured = {dose.liquid: dose.received_g for dose in strategy.result().doses}
+    assert held["rack/A1"] == pytest.approx(sum(mass or 0.0 for mass in poured.values()), abs=1.5)
+    assert held["source/water"] == pytest.approx(300.0 - (poured["water"] or 0.0), abs=4.0)
+    assert any(text.startswith("Put the empty receiver rack/A1 on the balance") for text in texts)
+    assert any(re.match(r"Put the receiver rack/A1, which holds 1\d g, on the balance", text) for text in texts)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dialect", ["sbi", "mt-sics"])
-def test_a_dose_over_other_balances(open_stage: OpenStage, dialect: str) -> None:
-    async def scenario() -> None:
-        async with open_stage(dosing_spec(dialect)) as stage:
-            check_amount(stage, await dosed(stage, 50), 50)
-
-    asyncio.run(scenario())
+async def test_a_dose_over_other_balances(open_stage: OpenStage, dialect: str) -> None:
+    async with open_stage(dosing_spec(dialect)) as stage:
+        check_amount(stage, await dosed(stage, 50), 50)
 
 
 @pytest.mark.slow
-def test_a_dose_over_a_balance_that_is_read_each_second(open_stage: OpenStage) -> None:
-    async def scenario() -> None:
-        async with open_stage(dosing_spec(interval=1.0)) as stage:
-            about = (await dosed(stage, 50)).notes["dose"]
-            assert about["end"] in ("reached", "missed", "short")
-            assert 1e3 * about["received"] == pytest.approx(50, abs=4.0)
-            assert about["received"] == pytest.approx(about["true"], abs=0.5e-3)
-            assert 0.9 < float(np.median(np.diff(about["read_at"]))) < 1.2
-
-    asyncio.run(scenario())
+async def test_a_dose_over_a_balance_that_is_read_each_second(open_stage: OpenStage) -> None:
+    async with open_stage(dosing_spec(interval=1.0)) as stage:
+        about = (await dosed(stage, 50)).notes["dose"]
+        assert about["end"] in ("reached", "missed", "short")
+        assert 1e3 * about["received"] == pytest.approx(50, abs=4.0)
+        assert about["received"] == pytest.approx(about["true"], abs=0.5e-3)
+        assert 0.9 < float(np.median(np.diff(about["read_at"]))) < 1.2
 
 
 @pytest.mark.slow
-def test_a_balance_that_is_too_slow_for_the_tolerance_pours_nothing(open_stage: OpenStage) -> None:
-    async def scenario() -> None:
-        async with open_stage(dosing_spec(interval=2.5)) as stage:
-            with pytest.raises(InvalidActionError, match=r"too slow for a tolerance of 1 g: a new reading each 2\.5 s"):
-                await dosed(stage, 50)
-            assert stage.contents.in_receiver == 0.0
-            assert "start" not in stage.heard
-
-    asyncio.run(scenario())
+async def test_a_balance_that_is_too_slow_for_the_tolerance_pours_nothing(open_stage: OpenStage) -> None:
+    async with open_stage(dosing_spec(interval=2.5)) as stage:
+        with pytest.raises(InvalidActionError, match=r"too slow for a tolerance of 1 g: a new reading each 2\.5 s"):
+            await dosed(stage, 50)
+        assert stage.contents.in_receiver == 0.0
+        assert "start" not in stage.heard
 
 
 @pytest.mark.slow
-def test_a_refill_device_fills_the_cup_of_an_arm(open_stage: OpenStage) -> None:
-    async def scenario() -> None:
-        refill = SourceSettings(refill=SimulatedPumpSettings(time_scale=0.0, factor=1.0))
-        async with open_stage(dosing_spec().with_values(source=refill)) as stage:
-            first = await dosed(stage, 50)
-            about, held = first.notes["dose"], stage.contents.in_pourer
-            asked = len(stage.heard)
-            source = DoseSource("beaker", 0.35, 5e-4, fill=True, constants=11, before=about["left"][0])
-            order = replace(target(25), source=source)
-            second = await stage.bench.pour(SCENE, ACTION, seed=6, dose=order)
-            assert "dose_source" not in stage.heard[asked:]
-            assert not stage.unsafe
-            received = second.notes["dose"]["received"]
-            assert received == pytest.approx(0.025, abs=4e-3)
-            assert stage.contents.in_pourer == pytest.approx(held + 0.35 - about["left"][0] - received, abs=5e-3)
-            assert second.notes["dose"]["left"][1] > 1.5e-3, "a refilled amount is less certain than a weighed one"
-
-    asyncio.run(scenario())
+async def test_a_refill_device_fills_the_cup_of_an_arm(open_stage: OpenStage) -> None:
+    refill = SourceSettings(refill=SimulatedPumpSettings(time_scale=0.0, factor=1.0))
+    async with open_stage(dosing_spec().with_values(source=refill)) as stage:
+        first = await dosed(stage, 50)
+        about, held = first.notes["dose"], stage.contents.in_pourer
+        asked = len(stage.heard)
+        source = DoseSource("beaker", 0.35, 5e-4, fill=True, constants=11, before=about["left"][0])
+        order = replace(target(25), source=source)
+        second = await stage.bench.pour(SCENE, ACTION, seed=6, dose=order)
+        assert "dose_source" not in stage.heard[asked:]
+        assert not stage.unsafe
+        received = second.notes["dose"]["received"]
+        assert received == pytest.approx(0.025, abs=4e-3)
+        assert stage.contents.in_pourer == pytest.approx(held + 0.35 - about["left"][0] - received, abs=5e-3)
+        assert second.notes["dose"]["left"][1] > 1.5e-3, "a refilled amount is less certain than a weighed one"
 
 
 @pytest.mark.slow
@@ -273,58 +255,46 @@ async def tilt_now(stage: Stage) -> float:
 
 
 @pytest.mark.slow
-def test_a_cut_line_turns_the_cup_back_and_the_amount_is_unknown(open_stage: OpenStage) -> None:
-    async def scenario() -> None:
-        async with open_stage(dosing_spec()) as stage:
-            text = await broken_off(stage, lambda: stage.site.order("unplug"))
-            assert "connection to the balance lost" in text
-            assert "unknown; estimated are" in text
-            assert await tilt_now(stage) < 2 * DEG
-            assert stage.contents.in_receiver < 0.1
-
-    asyncio.run(scenario())
+async def test_a_cut_line_turns_the_cup_back_and_the_amount_is_unknown(open_stage: OpenStage) -> None:
+    async with open_stage(dosing_spec()) as stage:
+        text = await broken_off(stage, lambda: stage.site.order("unplug"))
+        assert "connection to the balance lost" in text
+        assert "unknown; estimated are" in text
+        assert await tilt_now(stage) < 2 * DEG
+        assert stage.contents.in_receiver < 0.1
 
 
 @pytest.mark.slow
-def test_after_a_protective_stop_the_operator_lets_the_cup_be_brought_upright(open_stage: OpenStage) -> None:
-    async def scenario() -> None:
-        async with open_stage(dosing_spec()) as stage:
-            text = await broken_off(stage, lambda: stage.site.fault("protective_stop"))
-            assert stage.heard[-2:] == ["recover", "untilt"]
-            assert "the balance shows" in text
-            assert not stage.unsafe
-            assert await tilt_now(stage) < 2 * DEG
-
-    asyncio.run(scenario())
+async def test_after_a_protective_stop_the_operator_lets_the_cup_be_brought_upright(open_stage: OpenStage) -> None:
+    async with open_stage(dosing_spec()) as stage:
+        text = await broken_off(stage, lambda: stage.site.fault("protective_stop"))
+        assert stage.heard[-2:] == ["recover", "untilt"]
+        assert "the balance shows" in text
+        assert not stage.unsafe
+        assert await tilt_now(stage) < 2 * DEG
 
 
 @pytest.mark.slow
-def test_an_operators_stop_turns_the_cup_upright_first(open_stage: OpenStage) -> None:
-    async def scenario() -> None:
-        async with open_stage(dosing_spec()) as stage:
-            tilts = []
+async def test_an_operators_stop_turns_the_cup_upright_first(open_stage: OpenStage) -> None:
+    async with open_stage(dosing_spec()) as stage:
+        tilts = []
 
-            async def stop() -> None:
-                await stage.bench.arm.stop()
-                tilts.append(await tilt_now(stage))
+        async def stop() -> None:
+            await stage.bench.arm.stop()
+            tilts.append(await tilt_now(stage))
 
-            text = await broken_off(stage, stop)
-            assert tilts[0] < 2 * DEG
-            assert "turned back upright" in text
-            assert "in the receiver" in text
-
-    asyncio.run(scenario())
+        text = await broken_off(stage, stop)
+        assert tilts[0] < 2 * DEG
+        assert "turned back upright" in text
+        assert "in the receiver" in text
 
 
 @pytest.mark.slow
-def test_a_stalled_controller_is_noticed_and_the_amount_reported(open_stage: OpenStage) -> None:
-    async def scenario() -> None:
-        async with open_stage(dosing_spec()) as stage:
-            text = await broken_off(stage, lambda: stage.site.fault("stall", seconds=6.0, motion=False))
-            assert "in the receiver" in text or "unknown" in text.lower()
-            assert await tilt_now(stage) < 2 * DEG
-
-    asyncio.run(scenario())
+async def test_a_stalled_controller_is_noticed_and_the_amount_reported(open_stage: OpenStage) -> None:
+    async with open_stage(dosing_spec()) as stage:
+        text = await broken_off(stage, lambda: stage.site.fault("stall", seconds=6.0, motion=False))
+        assert "in the receiver" in text or "unknown" in text.lower()
+        assert await tilt_now(stage) < 2 * DEG
 
 
 CLIENT = """

@@ -60,29 +60,23 @@ class Site:
 
 
 @pytest.mark.parametrize(("balance", "expected"), [(False, 0.284), (True, 0.3)])
-def test_a_balance_under_the_pourer_corrects_the_flow_of_the_refill_pump(balance: bool, expected: float) -> None:
-    async def scenario() -> None:
-        site = Site(balance=balance)
-        assert await site.supply.top_up(0.2, WATER, seed=1)
-        assert site.contents.in_pourer == pytest.approx(expected, abs=5e-4)
-        await site.supply.close()
-
-    asyncio.run(scenario())
+async def test_a_balance_under_the_pourer_corrects_the_flow_of_the_refill_pump(balance: bool, expected: float) -> None:
+    site = Site(balance=balance)
+    assert await site.supply.top_up(0.2, WATER, seed=1)
+    assert site.contents.in_pourer == pytest.approx(expected, abs=5e-4)
+    await site.supply.close()
 
 
-def test_a_refilled_amount_is_less_certain_than_a_weighed_one() -> None:
-    async def scenario() -> None:
-        site = Site(balance=False)
-        source = DoseSource("beaker", 0.3, 5e-4, fill=True, constants=1, before=0.1)
-        filled = await site.supply.filled(source, WATER, seed=1)
-        assert filled is not None
-        assert not filled.fill
-        assert filled.deviation == pytest.approx(0.03 * 0.2, rel=0.01)
-        assert "source beaker: refilled with 200 g" in site.notices[-1].text
-        unknown = DoseSource("beaker", 0.3, 5e-4, fill=True, constants=1)
-        assert await site.supply.filled(unknown, WATER, seed=1) is None, "the operator fills what is unknown"
-
-    asyncio.run(scenario())
+async def test_a_refilled_amount_is_less_certain_than_a_weighed_one() -> None:
+    site = Site(balance=False)
+    source = DoseSource("beaker", 0.3, 5e-4, fill=True, constants=1, before=0.1)
+    filled = await site.supply.filled(source, WATER, seed=1)
+    assert filled is not None
+    assert not filled.fill
+    assert filled.deviation == pytest.approx(0.03 * 0.2, rel=0.01)
+    assert "source beaker: refilled with 200 g" in site.notices[-1].text
+    unknown = DoseSource("beaker", 0.3, 5e-4, fill=True, constants=1)
+    assert await site.supply.filled(unknown, WATER, seed=1) is None, "the operator fills what is unknown"
 
 
 def test_a_balance_of_the_source_needs_a_pump_and_its_place(tmp_path: Path) -> None:

@@ -41,35 +41,27 @@ async def cut(stage: Stage, hook: str, fault: Callable[[Stage], Awaitable[None]]
 
 @pytest.mark.realtime
 @pytest.mark.parametrize("fault", [drop_for_good, kill_emulator])
-def test_a_pour_is_made_by_a_restarted_bench_after_the_link_was_lost_before_the_tilt(
+async def test_a_pour_is_made_by_a_restarted_bench_after_the_link_was_lost_before_the_tilt(
     open_stage: Any, fault: Callable[[Stage], Awaitable[None]]
 ) -> None:
     """The arm stands above the receiver, the pourer upright."""
-
-    async def story() -> None:
-        async with open_stage(wired_spec(hurried=True)) as stage:
-            error = await cut(stage, "note", fault)
-            assert isinstance(error, LinkLostError), error
-            await stage.laboratory.restart_bench()
-            stage.attend()
-            measured = await asyncio.wait_for(stage.pour(), PATIENCE)
-            assert measured.spilled > 0.0
-
-    asyncio.run(story())
+    async with open_stage(wired_spec(hurried=True)) as stage:
+        error = await cut(stage, "note", fault)
+        assert isinstance(error, LinkLostError), error
+        await stage.laboratory.restart_bench()
+        stage.attend()
+        measured = await asyncio.wait_for(stage.pour(), PATIENCE)
+        assert measured.spilled > 0.0
 
 
 @pytest.mark.realtime
-def test_a_link_that_was_lost_when_the_tilt_was_asked_for_poured_nothing_if_the_arm_never_tilted(
+async def test_a_link_that_was_lost_when_the_tilt_was_asked_for_poured_nothing_if_the_arm_never_tilted(
     open_stage: Any,
 ) -> None:
     """The program never starts: the motion counts as begun, and the history of the emulated arm shows no tilt."""
-
-    async def story() -> None:
-        async with open_stage(wired_spec(hurried=True)) as stage:
-            error = await cut(stage, "tilts", lambda stage: stage.site.fault("drop"))
-            assert isinstance(error, LinkLostError), error
-
-    asyncio.run(story())
+    async with open_stage(wired_spec(hurried=True)) as stage:
+        error = await cut(stage, "tilts", lambda stage: stage.site.fault("drop"))
+        assert isinstance(error, LinkLostError), error
 
 
 def test_hardware_never_knows_that_nothing_flowed() -> None:

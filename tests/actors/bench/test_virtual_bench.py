@@ -38,17 +38,13 @@ def open_bench(fake, bench_spec):
 
 
 @pytest.mark.realtime
-def test_same_seed_and_action_measure_the_same_bits_whatever_was_poured_before(open_bench, scene, action):
-    async def play():
-        async with open_bench() as fresh:
-            first = await fresh.bench.pour(scene, action, seed=5)
-        async with open_bench() as used:
-            await used.bench.pour(scene, action.with_values(x_offset=0.1), seed=8)
-            other = await used.bench.pour(scene, action, seed=6)
-            again = await used.bench.pour(scene, action, seed=5)
-        return first, again, other
-
-    first, again, other = asyncio.run(play())
+async def test_same_seed_and_action_measure_the_same_bits_whatever_was_poured_before(open_bench, scene, action):
+    async with open_bench() as fresh:
+        first = await fresh.bench.pour(scene, action, seed=5)
+    async with open_bench() as used:
+        await used.bench.pour(scene, action.with_values(x_offset=0.1), seed=8)
+        other = await used.bench.pour(scene, action, seed=6)
+        again = await used.bench.pour(scene, action, seed=5)
     assert first == again
     assert first != other
 
@@ -90,14 +86,10 @@ def test_pose_errors_scatter_about_the_systematic_one_and_follow_the_seed(bench_
 
 
 @pytest.mark.realtime
-def test_checkpoints_come_in_order_and_the_bar_never_runs_backwards(open_bench, scene, action):
+async def test_checkpoints_come_in_order_and_the_bar_never_runs_backwards(open_bench, scene, action):
     seen = []
-
-    async def play():
-        async with open_bench(time_scale=25.0) as laboratory:
-            await laboratory.bench.pour(scene, action, seed=5, progress=seen.append)
-
-    asyncio.run(play())
+    async with open_bench(time_scale=25.0) as laboratory:
+        await laboratory.bench.pour(scene, action, seed=5, progress=seen.append)
     order = ["operator", "approach", "tilt", "hold", "return", "settle", "weigh", "record"]
     passed = list(dict.fromkeys(p.checkpoint for p in seen))
     assert [c for c in order if c in passed] == passed
@@ -162,14 +154,11 @@ def test_vessels_that_touch_as_they_truly_stand_make_the_pour_fail_and_the_bench
 
 
 @pytest.mark.realtime
-def test_a_load_beyond_the_brim_is_refused(open_bench, scene, action):
-    async def play():
-        async with open_bench() as laboratory:
-            flood = replace(scene, liquid=scene.liquid.model_copy(update={"mass": 2.0}))
-            with pytest.raises(InvalidActionError, match="to the brim"):
-                await laboratory.bench.pour(flood, action, seed=1)
-
-    asyncio.run(play())
+async def test_a_load_beyond_the_brim_is_refused(open_bench, scene, action):
+    async with open_bench() as laboratory:
+        flood = replace(scene, liquid=scene.liquid.model_copy(update={"mass": 2.0}))
+        with pytest.raises(InvalidActionError, match="to the brim"):
+            await laboratory.bench.pour(flood, action, seed=1)
 
 
 async def tilting(arm):
@@ -200,21 +189,18 @@ def test_a_stop_during_the_pour_leaves_it_unknown_and_the_bench_usable(request, 
 
 
 @pytest.mark.realtime
-def test_a_cancelled_pour_stops_the_arm_and_the_liquid(open_bench, scene, action):
-    async def play():
-        async with open_bench(time_scale=2.0, operator_time=0.5) as laboratory:
-            seen = []
-            pour = asyncio.create_task(laboratory.bench.pour(scene, action, seed=5, progress=seen.append))
-            await reach(seen, "approach", pour)
-            pour.cancel()
-            with pytest.raises(NotPouredError, match="nothing was poured"):
-                await pour
-            await asyncio.sleep(0.1)  # an arm that moves on would be seen to
-            state = await laboratory.bench.arm.state()
-            assert not state.moving
-            assert state.stopped
-
-    asyncio.run(play())
+async def test_a_cancelled_pour_stops_the_arm_and_the_liquid(open_bench, scene, action):
+    async with open_bench(time_scale=2.0, operator_time=0.5) as laboratory:
+        seen = []
+        pour = asyncio.create_task(laboratory.bench.pour(scene, action, seed=5, progress=seen.append))
+        await reach(seen, "approach", pour)
+        pour.cancel()
+        with pytest.raises(NotPouredError, match="nothing was poured"):
+            await pour
+        await asyncio.sleep(0.1)  # an arm that moves on would be seen to
+        state = await laboratory.bench.arm.state()
+        assert not state.moving
+        assert state.stopped
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import signal
 import subprocess
@@ -95,13 +94,9 @@ def test_hardware_and_other_machines_have_the_wall_clock(tmp_path: Path) -> None
         assert abs(clock.now - time.monotonic()) < 60.0
 
 
-def test_devices_do_not_age_while_the_liquid_of_the_bench_is_simulated(file: Path) -> None:
+async def test_devices_do_not_age_while_the_liquid_of_the_bench_is_simulated(file: Path) -> None:
     """On a slow machine the balance drifted by grams meanwhile."""
     controller, bench = SharedClock(file), SharedClock(file)
-
-    async def simulating() -> None:
-        async with standing(bench):
-            assert not controller.may_pass(2.0 * CREEP)
-        assert controller.may_pass(1e9)
-
-    asyncio.run(simulating())
+    async with standing(bench):
+        assert not controller.may_pass(2.0 * CREEP)
+    assert controller.may_pass(1e9)

@@ -220,26 +220,22 @@ def test_a_class_is_made_one_of_actors_once_however_many_there_are(ray_running) 
         asyncio.run(one.close())
 
 
-def test_a_process_that_hangs_is_given_up_long_before_the_deadline(
+async def test_a_process_that_hangs_is_given_up_long_before_the_deadline(
     ray_running: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from actors.runtime import remote_object as device
 
     monkeypatch.setattr(device, "LOOK_INTERVAL", 0.2)
     monkeypatch.setattr(device, "LOOK_DEADLINE", 1.0)
-
-    async def ask() -> None:
-        counter = device.RayDevice("counter", Counter, looked_after=True)
-        assert await counter.call("add", 1.0, deadline=PATIENCE) == 1, "what takes longer than a look is waited for"
-        os.kill(await counter.pid(), signal.SIGSTOP)
-        with pytest.raises(device.DeviceLostError, match="no answer to 'add'") as lost:
-            await counter.call("add", deadline=PATIENCE)
-        assert f"within {PATIENCE:.3g} s" not in str(lost.value)
-        assert await counter.revive()
-        assert await counter.call("add", deadline=PATIENCE) == 1
-        await counter.close()
-
-    asyncio.run(ask())
+    counter = device.RayDevice("counter", Counter, looked_after=True)
+    assert await counter.call("add", 1.0, deadline=PATIENCE) == 1, "what takes longer than a look is waited for"
+    os.kill(await counter.pid(), signal.SIGSTOP)
+    with pytest.raises(device.DeviceLostError, match="no answer to 'add'") as lost:
+        await counter.call("add", deadline=PATIENCE)
+    assert f"within {PATIENCE:.3g} s" not in str(lost.value)
+    assert await counter.revive()
+    assert await counter.call("add", deadline=PATIENCE) == 1
+    await counter.close()
 
 
 class Counter:

@@ -77,30 +77,24 @@ def held(ray_running: None, tmp_path: Path) -> tuple[RayDevice, Path]:
 
 
 @pytest.mark.ray
-def test_a_deadline_does_not_count_the_start_of_the_process(held: tuple[RayDevice, Path]) -> None:
+async def test_a_deadline_does_not_count_the_start_of_the_process(held: tuple[RayDevice, Path]) -> None:
     balance, file = held
-
-    async def play() -> None:
-        calls = [asyncio.create_task(balance.call("value", deadline=0.05, urgent=urgent)) for urgent in (True, False)]
-        done, _ = await asyncio.wait(calls, timeout=1.0)
-        assert not done, "a process that starts is neither given up nor killed"
-        file.touch()
-        assert await asyncio.gather(*calls) == [5, 5]
-        with pytest.raises(DeviceLostError, match=r"no answer to 'hang' within 0\.\d+ s"):
-            await balance.call("hang", deadline=0.05)
-        await balance.close()
-
-    asyncio.run(play())
+    calls = [asyncio.create_task(balance.call("value", deadline=0.05, urgent=urgent)) for urgent in (True, False)]
+    done, _ = await asyncio.wait(calls, timeout=1.0)
+    assert not done, "a process that starts is neither given up nor killed"
+    file.touch()
+    assert await asyncio.gather(*calls) == [5, 5]
+    with pytest.raises(DeviceLostError, match=r"no answer to 'hang' within 0\.\d+ s"):
+        await balance.call("hang", deadline=0.05)
+    await balance.close()
 
 
 @pytest.mark.ray
-def test_a_process_that_never_starts_is_lost(held: tuple[RayDevice, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_process_that_never_starts_is_lost(
+    held: tuple[RayDevice, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     balance, _ = held
     monkeypatch.setattr(device, "START_DEADLINE", 0.2)
-
-    async def play() -> None:
-        with pytest.raises(DeviceLostError, match="balance: no answer to 'value'"):
-            await balance.call("value", deadline=60.0)
-        await balance.close()
-
-    asyncio.run(play())
+    with pytest.raises(DeviceLostError, match="balance: no answer to 'value'"):
+        await balance.call("value", deadline=60.0)
+    await balance.close()

@@ -74,7 +74,9 @@ def test_a_loop_that_ends_before_its_simulators_are_up_leaves_no_task_behind(fak
     assert not [str(w.message) for w in recwarn if "never awaited" in str(w.message)]
 
 
-def test_while_no_process_can_be_started_simulations_fail_with_the_reason_and_nothing_spins(fake, task, monkeypatch):
+async def test_while_no_process_can_be_started_simulations_fail_with_the_reason_and_nothing_spins(
+    fake, task, monkeypatch
+):
     attempts = []
 
     class NoMemory(ConnectedProcess):
@@ -84,55 +86,44 @@ def test_while_no_process_can_be_started_simulations_fail_with_the_reason_and_no
 
     monkeypatch.setattr(local_worker, "ConnectedProcess", NoMemory)
     reported = []
-
-    async def play():
-        pool = WorkerPool(2, partial(local_worker.ProcessWorker, fake()), tell=reported.append)
-        with pytest.raises(LaboratoryError, match=r"a simulator can't be started: .*Cannot allocate memory"):
-            await pool.simulate(task())
-        await pool.close()
-
-    asyncio.run(play())
+    pool = WorkerPool(2, partial(local_worker.ProcessWorker, fake()), tell=reported.append)
+    with pytest.raises(LaboratoryError, match=r"a simulator can't be started: .*Cannot allocate memory"):
+        await pool.simulate(task())
+    await pool.close()
     assert len(attempts) == 2
     assert len(reported) == 1
 
 
-def test_a_process_killed_while_the_pool_closes_leaves_no_task_behind(fake, task, tmp_path, caplog, recwarn):
+async def test_a_process_killed_while_the_pool_closes_leaves_no_task_behind(fake, task, tmp_path, caplog, recwarn):
     log = tmp_path / "log"
-
-    async def play():
-        pool = process_pool(2, make=fake(60.0, log))
-        jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in (1, 2)]
-        await until(lambda: count(log, "begin") == 2)
-        closing = asyncio.create_task(pool.close())
-        await asyncio.sleep(0)
-        for line in lines(log):
-            if line.startswith("made"):
-                os.kill(int(line.split()[1]), signal.SIGKILL)
-        await closing
-        await asyncio.gather(*jobs, return_exceptions=True)
-
-    asyncio.run(play())
+    pool = process_pool(2, make=fake(60.0, log))
+    jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in (1, 2)]
+    await until(lambda: count(log, "begin") == 2)
+    closing = asyncio.create_task(pool.close())
+    await asyncio.sleep(0)
+    for line in lines(log):
+        if line.startswith("made"):
+            os.kill(int(line.split()[1]), signal.SIGKILL)
+    await closing
+    await asyncio.gather(*jobs, return_exceptions=True)
     gc.collect()
     assert "Task was destroyed" not in caplog.text
     assert not [str(w.message) for w in recwarn if "never awaited" in str(w.message)]
     assert not any(alive(int(line.split()[1])) for line in lines(log))
 
 
-def test_simulators_end_although_the_bench_can_not_be_closed(fake):
+async def test_simulators_end_although_the_bench_can_not_be_closed(fake):
     class Broken:
         async def close(self):
             raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
 
-    async def play():
-        laboratory = InProcessLaboratory(LaboratorySettings(name="test"), fake(), processes=1)
-        await laboratory.__aenter__()
-        pids = await laboratory.simulators.pids()
-        laboratory._opened = Broken()
-        with pytest.raises(OSError, match="Cannot allocate memory"):
-            await laboratory.__aexit__()
-        return pids, [pid for pid in pids if alive(pid)]
-
-    pids, left = asyncio.run(play())
+    laboratory = InProcessLaboratory(LaboratorySettings(name="test"), fake(), processes=1)
+    await laboratory.__aenter__()
+    pids = await laboratory.simulators.pids()
+    laboratory._opened = Broken()
+    with pytest.raises(OSError, match="Cannot allocate memory"):
+        await laboratory.__aexit__()
+    left = [pid for pid in pids if alive(pid)]
     assert pids
     assert left == []
 
@@ -226,37 +217,29 @@ def test_vessels_that_touch_are_an_invalid_action_and_the_pool_goes_on(make_pool
 
 
 @pytest.mark.realtime
-def test_an_error_of_the_engine_names_itself_and_the_pool_goes_on(make_pool, fake, task):
-    async def play():
-        pool = make_pool(fake())
-        with pytest.raises(SimulationError, match="ZeroDivisionError: spacing"):
-            await pool.simulate(task(name="broken"))
-        with pytest.raises(SimulationError, match="answered with a str, not with a simulated pour"):
-            await pool.simulate(task(name="odd"))
-        assert (await pool.simulate(task())).outcome.seed == 1
-        assert pool.statistics().deaths == 0
-        await pool.close()
-
-    asyncio.run(play())
+async def test_an_error_of_the_engine_names_itself_and_the_pool_goes_on(make_pool, fake, task):
+    pool = make_pool(fake())
+    with pytest.raises(SimulationError, match="ZeroDivisionError: spacing"):
+        await pool.simulate(task(name="broken"))
+    with pytest.raises(SimulationError, match="answered with a str, not with a simulated pour"):
+        await pool.simulate(task(name="odd"))
+    assert (await pool.simulate(task())).outcome.seed == 1
+    assert pool.statistics().deaths == 0
+    await pool.close()
 
 
 @pytest.mark.realtime
-def test_a_cancelled_simulation_really_stops_and_the_next_one_runs_at_once(make_pool, fake, task, tmp_path):
+async def test_a_cancelled_simulation_really_stops_and_the_next_one_runs_at_once(make_pool, fake, task, tmp_path):
     log = tmp_path / "log"
-
-    async def play():
-        pool = make_pool(fake(2 * PATIENCE, log))
-        job = asyncio.create_task(pool.simulate(task()))
-        await until(lambda: count(log, "begin") == 1)
-        job.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await job
-        await pool.simulate(task(name="quick"))
-        statistics = pool.statistics()
-        await pool.close()
-        return statistics
-
-    statistics = asyncio.run(play())
+    pool = make_pool(fake(2 * PATIENCE, log))
+    job = asyncio.create_task(pool.simulate(task()))
+    await until(lambda: count(log, "begin") == 1)
+    job.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await job
+    await pool.simulate(task(name="quick"))
+    statistics = pool.statistics()
+    await pool.close()
     assert count(log, "cancelled") == 1
     assert count(log, "made") == 1, "the member was kept, its compiled kernels with it"
     assert statistics.cancelled == 1
@@ -265,37 +248,30 @@ def test_a_cancelled_simulation_really_stops_and_the_next_one_runs_at_once(make_
 
 
 @pytest.mark.realtime
-def test_a_job_cancelled_in_the_queue_never_begins(make_pool, fake, task, tmp_path):
+async def test_a_job_cancelled_in_the_queue_never_begins(make_pool, fake, task, tmp_path):
     log = tmp_path / "log"
-
-    async def play():
-        pool = make_pool(fake(0.5, log))
-        first = asyncio.create_task(pool.simulate(task(seed=1)))
-        await until(lambda: count(log, "begin") == 1)
-        second = asyncio.create_task(pool.simulate(task(seed=2)))
-        await asyncio.sleep(0.05)  # it waits behind the first, and must not be given to a worker
-        second.cancel()
-        await first
-        await pool.simulate(task(seed=3))
-        await pool.close()
-
-    asyncio.run(play())
+    pool = make_pool(fake(0.5, log))
+    first = asyncio.create_task(pool.simulate(task(seed=1)))
+    await until(lambda: count(log, "begin") == 1)
+    second = asyncio.create_task(pool.simulate(task(seed=2)))
+    await asyncio.sleep(0.05)  # it waits behind the first, and must not be given to a worker
+    second.cancel()
+    await first
+    await pool.simulate(task(seed=3))
+    await pool.close()
     assert count(log, "begin") == 2
 
 
 @pytest.mark.realtime
-def test_busy_time_counts_the_jobs_and_not_the_waiting(make_pool, fake, task):
-    async def play():
-        pool = make_pool(fake(0.3))
-        await pool.simulate(task(name="quick"))
-        before = pool.statistics().busy_s
-        await asyncio.sleep(0.3)  # the pool is idle, which must not be counted
-        await asyncio.gather(*(pool.simulate(task(seed=s)) for s in range(3)))
-        after = pool.statistics()
-        await pool.close()
-        return after.busy_s - before, after.jobs
-
-    busy, jobs = asyncio.run(play())
+async def test_busy_time_counts_the_jobs_and_not_the_waiting(make_pool, fake, task):
+    pool = make_pool(fake(0.3))
+    await pool.simulate(task(name="quick"))
+    before = pool.statistics().busy_s
+    await asyncio.sleep(0.3)  # the pool is idle, which must not be counted
+    await asyncio.gather(*(pool.simulate(task(seed=s)) for s in range(3)))
+    after = pool.statistics()
+    await pool.close()
+    busy, jobs = after.busy_s - before, after.jobs
     assert jobs == 4
     assert busy == pytest.approx(0.9, abs=0.25)
 
@@ -318,21 +294,16 @@ def test_simulators_step_back_behind_an_arm_s_driver_which_does_not(ray_running,
 
 @pytest.mark.realtime
 @pytest.mark.ray
-def test_a_job_whose_simulator_is_killed_is_answered_by_its_replacement(ray_running, fake, task, tmp_path):
+async def test_a_job_whose_simulator_is_killed_is_answered_by_its_replacement(ray_running, fake, task, tmp_path):
     log = tmp_path / "log"
-
-    async def play():
-        pool = ray_pool(2, make=fake(1.0, log))
-        jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in range(4)]
-        await until(lambda: count(log, "begin") == 2)
-        victim = int(next(line for line in lines(log) if line.startswith("begin")).split()[1])
-        os.kill(victim, signal.SIGKILL)
-        results = await asyncio.gather(*jobs)
-        statistics, members = pool.statistics(), await pool.pids()
-        await pool.close()
-        return results, statistics, members, victim
-
-    results, statistics, members, victim = asyncio.run(play())
+    pool = ray_pool(2, make=fake(1.0, log))
+    jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in range(4)]
+    await until(lambda: count(log, "begin") == 2)
+    victim = int(next(line for line in lines(log) if line.startswith("begin")).split()[1])
+    os.kill(victim, signal.SIGKILL)
+    results = await asyncio.gather(*jobs)
+    statistics, members = pool.statistics(), await pool.pids()
+    await pool.close()
     assert [r.outcome.seed for r in results] == [0, 1, 2, 3]
     assert statistics.deaths == 1
     assert len(members) == 2
@@ -341,30 +312,24 @@ def test_a_job_whose_simulator_is_killed_is_answered_by_its_replacement(ray_runn
 
 @pytest.mark.realtime
 @pytest.mark.ray
-def test_a_job_that_kills_every_simulator_is_given_up_and_the_pool_survives(ray_running, fake, task):
-    async def play():
-        pool = ray_pool(1, make=fake(), retries=1)
-        with pytest.raises(SimulationError, match="2 simulators died over this job"):
-            await pool.simulate(task(name="deadly"))
-        assert (await pool.simulate(task())).outcome.seed == 1
-        assert pool.statistics().deaths == 2
-        await pool.close()
-
-    asyncio.run(play())
+async def test_a_job_that_kills_every_simulator_is_given_up_and_the_pool_survives(ray_running, fake, task):
+    pool = ray_pool(1, make=fake(), retries=1)
+    with pytest.raises(SimulationError, match="2 simulators died over this job"):
+        await pool.simulate(task(name="deadly"))
+    assert (await pool.simulate(task())).outcome.seed == 1
+    assert pool.statistics().deaths == 2
+    await pool.close()
 
 
 @pytest.mark.realtime
 @pytest.mark.ray
-def test_a_simulation_that_hangs_past_its_deadline_costs_its_simulator(ray_running, fake, task):
-    async def play():
-        pool = ray_pool(1, make=fake(60.0), deadline=1.0)
-        with pytest.raises(SimulationError, match="no result within 1 s"):
-            await pool.simulate(task())
-        pool._deadline = PATIENCE  # for a simulator that starts on a busy machine
-        assert (await pool.simulate(task(name="quick"))).outcome.seed == 1
-        await pool.close()
-
-    asyncio.run(play())
+async def test_a_simulation_that_hangs_past_its_deadline_costs_its_simulator(ray_running, fake, task):
+    pool = ray_pool(1, make=fake(60.0), deadline=1.0)
+    with pytest.raises(SimulationError, match="no result within 1 s"):
+        await pool.simulate(task())
+    pool._deadline = PATIENCE  # for a simulator that starts on a busy machine
+    assert (await pool.simulate(task(name="quick"))).outcome.seed == 1
+    await pool.close()
 
 
 @pytest.mark.realtime
@@ -387,24 +352,21 @@ def test_a_simulator_goes_on_with_the_next_job_while_the_program_is_held_up(ray_
 
 @pytest.mark.realtime
 @pytest.mark.ray
-def test_a_job_that_waits_at_a_busy_simulator_is_taken_to_an_idle_one_and_runs_once(ray_running, fake, task, tmp_path):
+async def test_a_job_that_waits_at_a_busy_simulator_is_taken_to_an_idle_one_and_runs_once(
+    ray_running, fake, task, tmp_path
+):
     log = tmp_path / "log"
-
-    async def play():
-        pool = ray_pool(2, make=fake(4.0, log))
-        await pool.pids()
-        long, other, waiting = (asyncio.create_task(pool.simulate(task(seed=s))) for s in range(3))
-        await until(lambda: count(log, "begin") == 2)
-        other.cancel()  # its simulator becomes idle; the third job was sent behind the first or behind this one
-        await until(lambda: count(log, "begin") == 3)
-        waited_for_the_first = long.done()
-        assert (await waiting).outcome.seed == 2
-        assert (await long).outcome.seed == 0
-        deaths = pool.statistics().deaths
-        await pool.close()
-        return waited_for_the_first, deaths
-
-    waited_for_the_first, deaths = asyncio.run(play())
+    pool = ray_pool(2, make=fake(4.0, log))
+    await pool.pids()
+    long, other, waiting = (asyncio.create_task(pool.simulate(task(seed=s))) for s in range(3))
+    await until(lambda: count(log, "begin") == 2)
+    other.cancel()  # its simulator becomes idle; the third job was sent behind the first or behind this one
+    await until(lambda: count(log, "begin") == 3)
+    waited_for_the_first = long.done()
+    assert (await waiting).outcome.seed == 2
+    assert (await long).outcome.seed == 0
+    deaths = pool.statistics().deaths
+    await pool.close()
     assert not waited_for_the_first
     assert deaths == 0
     assert count(log, "begin") == 3
@@ -412,37 +374,29 @@ def test_a_job_that_waits_at_a_busy_simulator_is_taken_to_an_idle_one_and_runs_o
 
 @pytest.mark.realtime
 @pytest.mark.ray
-def test_a_simulator_with_other_code_than_this_machine_s_is_not_used_and_named(ray_running, fake, task):
+async def test_a_simulator_with_other_code_than_this_machine_s_is_not_used_and_named(ray_running, fake, task):
     told = []
-
-    async def play():
-        other = dataclasses.replace(versions(), engine="taichi 1.6.0")
-        pool = ray_pool(1, make=fake(), expected=other, tell=told.append)
-        with pytest.raises(
-            LaboratoryError, match=r"is not like this machine's: Engine: \w+ [\d.]+ there, taichi 1\.6\.0 here"
-        ):
-            await pool.simulate(task())
-        await pool.close()
-
-    asyncio.run(play())
+    other = dataclasses.replace(versions(), engine="taichi 1.6.0")
+    pool = ray_pool(1, make=fake(), expected=other, tell=told.append)
+    with pytest.raises(
+        LaboratoryError, match=r"is not like this machine's: Engine: \w+ [\d.]+ there, taichi 1\.6\.0 here"
+    ):
+        await pool.simulate(task())
+    await pool.close()
     assert len(told) == 1
 
 
 @pytest.mark.realtime
 @pytest.mark.ray
-def test_a_loss_is_told_with_what_is_repeated(ray_running, fake, task, tmp_path):
+async def test_a_loss_is_told_with_what_is_repeated(ray_running, fake, task, tmp_path):
     told, log = [], tmp_path / "log"
-
-    async def play():
-        pool = ray_pool(1, make=fake(0.5, log), tell=told.append)
-        jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in range(2)]
-        await until(lambda: count(log, "begin") == 1)
-        os.kill((await pool.pids())[0], signal.SIGKILL)
-        await asyncio.gather(*jobs)
-        await until(lambda: told)
-        await pool.close()
-
-    asyncio.run(play())
+    pool = ray_pool(1, make=fake(0.5, log), tell=told.append)
+    jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in range(2)]
+    await until(lambda: count(log, "begin") == 1)
+    os.kill((await pool.pids())[0], signal.SIGKILL)
+    await asyncio.gather(*jobs)
+    await until(lambda: told)
+    await pool.close()
     assert "1 simulator(s) lost" in told[0]
     assert "2 simulation(s) are repeated" in told[0]
 
@@ -491,13 +445,10 @@ def test_both_pools_give_the_same_results_bit_for_bit(ray_running, fake, task):
 
 @pytest.mark.realtime
 @pytest.mark.ray
-def test_a_closed_pool_lets_no_process_live_and_says_so(ray_running, fake, task):
-    async def play():
-        pool = ray_pool(2, make=fake())
-        members = await pool.pids()
-        await pool.close()
-        await until(lambda: not any(map(alive, members)))
-        with pytest.raises(SimulationError, match="closed"):
-            await pool.simulate(task())
-
-    asyncio.run(play())
+async def test_a_closed_pool_lets_no_process_live_and_says_so(ray_running, fake, task):
+    pool = ray_pool(2, make=fake())
+    members = await pool.pids()
+    await pool.close()
+    await until(lambda: not any(map(alive, members)))
+    with pytest.raises(SimulationError, match="closed"):
+        await pool.simulate(task())

@@ -42,39 +42,33 @@ async def settled() -> None:
         await asyncio.sleep(0)
 
 
-def test_one_that_asks_for_much_leaves_every_second_turn_to_the_other() -> None:
-    async def work() -> None:
-        worker = HeldWorker()
-        pool = WorkerPool(1, lambda: worker, ahead=1)
-        await pool.pids()
-        greedy, modest = pool.share(), pool.share()
-        jobs = [asyncio.create_task(greedy.simulate(f"g{i}")) for i in range(8)]  # type: ignore[arg-type]
+async def test_one_that_asks_for_much_leaves_every_second_turn_to_the_other() -> None:
+    worker = HeldWorker()
+    pool = WorkerPool(1, lambda: worker, ahead=1)
+    await pool.pids()
+    greedy, modest = pool.share(), pool.share()
+    jobs = [asyncio.create_task(greedy.simulate(f"g{i}")) for i in range(8)]  # type: ignore[arg-type]
+    await settled()
+    jobs += [asyncio.create_task(modest.simulate(f"m{i}")) for i in range(3)]  # type: ignore[arg-type]
+    await settled()
+    for i in range(11):
+        worker.end(worker.begun[i])
         await settled()
-        jobs += [asyncio.create_task(modest.simulate(f"m{i}")) for i in range(3)]  # type: ignore[arg-type]
-        await settled()
-        for i in range(11):
-            worker.end(worker.begun[i])
-            await settled()
-        assert sorted(await asyncio.gather(*jobs)) == sorted([f"g{i}" for i in range(8)] + [f"m{i}" for i in range(3)])  # type: ignore[type-var]
-        assert worker.begun[:8] == ["g0", "g1", "g2", "m0", "g3", "m1", "g4", "m2"]
-
-    asyncio.run(work())
+    assert sorted(await asyncio.gather(*jobs)) == sorted([f"g{i}" for i in range(8)] + [f"m{i}" for i in range(3)])  # type: ignore[type-var]
+    assert worker.begun[:8] == ["g0", "g1", "g2", "m0", "g3", "m1", "g4", "m2"]
 
 
 @pytest.mark.parametrize("when", ["waiting", "sent", "under way"])
-def test_whoever_gives_up_takes_nobody_elses_turn(when: str) -> None:
-    async def work() -> None:
-        worker = HeldWorker()
-        share = WorkerPool(1, lambda: worker, ahead=1).share()
-        jobs = [asyncio.create_task(share.simulate(i)) for i in range(4)]  # type: ignore[arg-type]
+async def test_whoever_gives_up_takes_nobody_elses_turn(when: str) -> None:
+    worker = HeldWorker()
+    share = WorkerPool(1, lambda: worker, ahead=1).share()
+    jobs = [asyncio.create_task(share.simulate(i)) for i in range(4)]  # type: ignore[arg-type]
+    await settled()
+    jobs[{"waiting": 2, "sent": 1, "under way": 0}[when]].cancel()
+    for i in range(4):
         await settled()
-        jobs[{"waiting": 2, "sent": 1, "under way": 0}[when]].cancel()
-        for i in range(4):
-            await settled()
-            worker.end(i)
-        done = await asyncio.gather(*jobs, return_exceptions=True)
-        assert [isinstance(one, asyncio.CancelledError) for one in done].count(True) == 1
-        assert worker.begun == ([0, 1, 3] if when == "waiting" else [0, 1, 2, 3])
-        assert await asyncio.wait_for(share.simulate(0), 5.0) == 0  # type: ignore[arg-type, comparison-overlap]
-
-    asyncio.run(work())
+        worker.end(i)
+    done = await asyncio.gather(*jobs, return_exceptions=True)
+    assert [isinstance(one, asyncio.CancelledError) for one in done].count(True) == 1
+    assert worker.begun == ([0, 1, 3] if when == "waiting" else [0, 1, 2, 3])
+    assert await asyncio.wait_for(share.simulate(0), 5.0) == 0  # type: ignore[arg-type, comparison-overlap]

@@ -6,17 +6,14 @@ import json
 from pathlib import Path
 
 from orchestrator.daemon.http_api import openapi_text
-from tests.support.toy_daemon import run, serving
+from tests.support.toy_daemon import serving
 
 COMMITTED = Path(__file__).parents[3] / "docs" / "openapi.json"
 
 
-def test_the_served_description_is_the_committed_one(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with serving(tmp_path) as served:
-            assert (await served.http.get("/api/v1/openapi.json")).text == COMMITTED.read_text(encoding="utf-8")
-
-    run(work())
+async def test_the_served_description_is_the_committed_one(tmp_path: Path) -> None:
+    async with serving(tmp_path) as served:
+        assert (await served.http.get("/api/v1/openapi.json")).text == COMMITTED.read_text(encoding="utf-8")
 
 
 def test_a_start_is_described_as_it_is_accepted_and_texts_as_text() -> None:

@@ -21,42 +21,38 @@ from actors.laboratory import WarmSimulators
 from orchestrator.daemon import server_process
 from orchestrator.daemon.rigs import supervisor
 from orchestrator.daemon.server_process import MOST, RENEWED, DaemonRestart, RayWatch, log_lines
-from tests.support.toy_daemon import held, run, serving
+from tests.support.toy_daemon import held, serving
 from tests.support.waiting import wait_async, wait_for
 
 
-def test_a_pour_is_finished_before_and_its_campaign_goes_on_after(
+async def test_a_pour_is_finished_before_and_its_campaign_goes_on_after(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lost = ["raylet"]
     monkeypatch.setattr(supervisor, "LEAVING", 0.05)
-
-    async def work() -> None:
-        async with serving(tmp_path, held) as served:
-            keys = [await served.submit(), await served.submit()]
-            laboratory = await served.pouring()
-            monkeypatch.setattr(WarmSimulators, "lost", property(lambda self: lost[0]))
-            assert served.supervisor.pouring
-            served.supervisor.leave("raylet")
-            told = await served.post("/queue/pause")
-            told = await served.post(f"/campaigns/{keys[1]}/resume", status=409)
-            assert "just beginning anew" in told["detail"]
-            (problem,) = (await served.get("/status"))["problems"]
-            assert "Ray has lost its raylet" in problem
-            await asyncio.sleep(0.2)  # a server that ends would have begun to
-            assert not served.supervisor.left.is_set()
-            assert laboratory.bench.aborted == []
-            laboratory.bench.go.set()
-            await served.supervisor.left.wait()
-            found = await served.until(keys[0], "paused")
-            assert [pour["state"] for pour in found["pours_made"]] == ["weighed"]
-            await served.post("/queue/resume")
-        lost[0] = ""
-        async with serving(tmp_path) as served:
-            for key in keys:
-                await served.until(key, "finished")
-
-    run(work())
+    async with serving(tmp_path, held) as served:
+        keys = [await served.submit(), await served.submit()]
+        laboratory = await served.pouring()
+        monkeypatch.setattr(WarmSimulators, "lost", property(lambda self: lost[0]))
+        assert served.supervisor.pouring
+        served.supervisor.leave("raylet")
+        told = await served.post("/queue/pause")
+        told = await served.post(f"/campaigns/{keys[1]}/resume", status=409)
+        assert "just beginning anew" in told["detail"]
+        (problem,) = (await served.get("/status"))["problems"]
+        assert "Ray has lost its raylet" in problem
+        await asyncio.sleep(0.2)  # a server that ends would have begun to
+        assert not served.supervisor.left.is_set()
+        assert laboratory.bench.aborted == []
+        laboratory.bench.go.set()
+        await served.supervisor.left.wait()
+        found = await served.until(keys[0], "paused")
+        assert [pour["state"] for pour in found["pours_made"]] == ["weighed"]
+        await served.post("/queue/resume")
+    lost[0] = ""
+    async with serving(tmp_path) as served:
+        for key in keys:
+            await served.until(key, "finished")
 
 
 class Daemon:

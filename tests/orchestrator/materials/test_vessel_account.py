@@ -28,7 +28,7 @@ from tests.support import mixtures
 from tests.support.cli_inputs import invoke
 from tests.support.station import BEAKER, content, rigs_in
 from tests.support.toy_campaign import ToyOptimizer, ToySimulators
-from tests.support.toy_daemon import HeldBench, HeldLaboratory, campaign_in, run, serving
+from tests.support.toy_daemon import HeldBench, HeldLaboratory, campaign_in, serving
 
 SERIES = """\
 name: series
@@ -146,7 +146,7 @@ class DosingBench(HeldBench):
         return PourMeasurement(dose.source.mass, 3e-4, left, {"dose": {"received": 0.0302, "left": [left, 4e-4]}})
 
 
-def test_a_campaign_of_the_daemon_pours_out_of_a_vessel_of_the_station(
+async def test_a_campaign_of_the_daemon_pours_out_of_a_vessel_of_the_station(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DECANT_STATE", str(tmp_path / "state"))
@@ -155,48 +155,39 @@ def test_a_campaign_of_the_daemon_pours_out_of_a_vessel_of_the_station(
     def make() -> HeldLaboratory:
         return HeldLaboratory(ToySimulators(), DosingBench(), ToyOptimizer())
 
-    async def work() -> None:
-        async with serving(tmp_path, make, rigs=rigs_in(tmp_path)) as served:
-            await served.post("/materials/liquids", {"id": "water"})
-            await served.post("/materials/vessels", {"id": "beaker", "shape": BEAKER})
-            weighed = {"mass": "90 g", "liquid": "water", "deviation": "0.1 g"}
-            await served.post("/materials/vessels/beaker/weighed", weighed)
-            await served.until(await served.submit(rig="left"), "finished")
-            found = await content(served, "beaker")
-            assert found["mass_g"] == pytest.approx(59.5)
-            assert found["pour"].startswith("series-")
-            for _ in range(2):  # a person pours; a repeated entry counts once
-                body = {"id": "m-1", "source": "beaker", "receiver": "jar/cup", "mass": "9.5 g", "note": "by eye"}
-                await served.post("/materials/pours", body)
-            found = await served.get("/materials")
-            assert found["vessels"][0]["content"]["mass_g"] == pytest.approx(50.0)
-            assert [(one["id"], one["content"]["mass_g"]) for one in found["sources"]] == [
-                ("jar/cup", pytest.approx(9.5))
-            ]
-            kinds = [one["kind"] for one in await served.get("/materials/account", vessel="beaker")]
-            assert kinds == ["weighed", "weighed", "begun", "poured", "poured"]
-            await served.post("/materials/vessels/jar/cup/weighed", {"mass": "9 g"})
-            found = (await served.get("/materials"))["sources"][0]
-            assert (found["content"]["mass_g"], found["position"]) == (pytest.approx(9.0), "")
-            await served.post("/materials/vessels/jar/cup/place", {"position": "shelf"})
-            assert (await served.get("/materials"))["sources"][0]["position"] == "shelf"
-
-    run(work())
+    async with serving(tmp_path, make, rigs=rigs_in(tmp_path)) as served:
+        await served.post("/materials/liquids", {"id": "water"})
+        await served.post("/materials/vessels", {"id": "beaker", "shape": BEAKER})
+        weighed = {"mass": "90 g", "liquid": "water", "deviation": "0.1 g"}
+        await served.post("/materials/vessels/beaker/weighed", weighed)
+        await served.until(await served.submit(rig="left"), "finished")
+        found = await content(served, "beaker")
+        assert found["mass_g"] == pytest.approx(59.5)
+        assert found["pour"].startswith("series-")
+        for _ in range(2):  # a person pours; a repeated entry counts once
+            body = {"id": "m-1", "source": "beaker", "receiver": "jar/cup", "mass": "9.5 g", "note": "by eye"}
+            await served.post("/materials/pours", body)
+        found = await served.get("/materials")
+        assert found["vessels"][0]["content"]["mass_g"] == pytest.approx(50.0)
+        assert [(one["id"], one["content"]["mass_g"]) for one in found["sources"]] == [("jar/cup", pytest.approx(9.5))]
+        kinds = [one["kind"] for one in await served.get("/materials/account", vessel="beaker")]
+        assert kinds == ["weighed", "weighed", "begun", "poured", "poured"]
+        await served.post("/materials/vessels/jar/cup/weighed", {"mass": "9 g"})
+        found = (await served.get("/materials"))["sources"][0]
+        assert (found["content"]["mass_g"], found["position"]) == (pytest.approx(9.0), "")
+        await served.post("/materials/vessels/jar/cup/place", {"position": "shelf"})
+        assert (await served.get("/materials"))["sources"][0]["position"] == "shelf"
 
 
-def test_a_lone_surrogate_in_a_liquid_is_refused(tmp_path: Path) -> None:
+async def test_a_lone_surrogate_in_a_liquid_is_refused(tmp_path: Path) -> None:
     """The refusal quotes it, and UTF-8 has no code for it."""
-
-    async def work() -> None:
-        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served:
-            client, headers = served.http, {**served.headers(), "Content-Type": "application/json"}
-            for properties in (r'{"\ud969x": null}', r'{"name": "\ud969"}', r'{"density": "1 \ud969"}'):
-                body = f'{{"id": "water", "properties": {properties}}}'
-                answer = await client.post("/api/v1/materials/liquids", content=body, headers=headers)
-                assert answer.status_code == 422, answer.text
-                assert answer.json()["detail"]
-
-    run(work())
+    async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served:
+        client, headers = served.http, {**served.headers(), "Content-Type": "application/json"}
+        for properties in (r'{"\ud969x": null}', r'{"name": "\ud969"}', r'{"density": "1 \ud969"}'):
+            body = f'{{"id": "water", "properties": {properties}}}'
+            answer = await client.post("/api/v1/materials/liquids", content=body, headers=headers)
+            assert answer.status_code == 422, answer.text
+            assert answer.json()["detail"]
 
 
 def test_a_person_weighs_a_source_on_the_command_line_and_sees_what_is_left(

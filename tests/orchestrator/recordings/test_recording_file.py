@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import functools
 import json
@@ -424,19 +423,15 @@ SERIES = series(25, 20, outputs="directory: runs, figures: false, recording: fal
 
 
 @pytest.mark.slow
-def test_a_run_records_its_doses_and_they_can_be_exported_again(
+async def test_a_run_records_its_doses_and_they_can_be_exported_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DECANT_STATE", str(tmp_path / "state"))
     plan = load_campaign(write_campaign(tmp_path, SERIES))
     resources = RunResources(in_process=True)
-
-    async def scenario() -> None:
-        with contextlib.closing(RunService().start(run_task(plan), resources)) as handle:
-            await handle.wait()
-            publish_run(handle)
-
-    asyncio.run(scenario())
+    with contextlib.closing(RunService().start(run_task(plan), resources)) as handle:
+        await handle.wait()
+        publish_run(handle)
     run = next((tmp_path / "runs").iterdir())
     doses = load_recordings([run / "recordings"])
     assert [one.gain for one in doses] == pytest.approx([0.025, 0.020], abs=1.5e-3)

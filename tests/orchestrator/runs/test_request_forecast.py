@@ -99,95 +99,82 @@ def test_the_next_receivers_prior_is_made_beside_this_ones_pours(tmp_path: Path)
     assert not again, "what was made ahead is not made twice"
 
 
-def test_what_was_foreseen_makes_room_for_what_is_asked_for() -> None:
-    async def check() -> None:
-        given_up: list[int] = []
-        begun: list[int] = []
+async def test_what_was_foreseen_makes_room_for_what_is_asked_for() -> None:
+    given_up: list[int] = []
+    begun: list[int] = []
 
-        async def work(request: Simulate) -> Outcome:
-            begun.append(request.seed)
-            try:
-                await asyncio.sleep(3600.0)  # it is cancelled here
-            except asyncio.CancelledError:
-                given_up.append(request.seed)
-                raise
-            raise AssertionError
+    async def work(request: Simulate) -> Outcome:
+        begun.append(request.seed)
+        try:
+            await asyncio.sleep(3600.0)  # it is cancelled here
+        except asyncio.CancelledError:
+            given_up.append(request.seed)
+            raise
+        raise AssertionError
 
-        ahead = SpeculativeExecution(work, width=2)
-        for seed in (1, 2, 3):
-            ahead.predict(simulate(seed))
-        await asyncio.sleep(0)
-        assert begun == [1, 2]
+    ahead = SpeculativeExecution(work, width=2)
+    for seed in (1, 2, 3):
+        ahead.predict(simulate(seed))
+    await asyncio.sleep(0)
+    assert begun == [1, 2]
+    with ahead.asked_for():
+        await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
+        assert given_up == [2]
         with ahead.asked_for():
             await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
-            assert given_up == [2]
-            with ahead.asked_for():
-                await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
-                assert given_up == [2, 1]
-        await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
-        assert begun == [1, 2, 1, 2], "made anew when there is room"
-        await ahead.close()
-        assert given_up == [2, 1, 1, 2]
-
-    asyncio.run(check())
+            assert given_up == [2, 1]
+    await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
+    assert begun == [1, 2, 1, 2], "made anew when there is room"
+    await ahead.close()
+    assert given_up == [2, 1, 1, 2]
 
 
 @pytest.mark.parametrize(("processors", "at_once"), [(3, 2), (2, 2), (4, 3), (None, 2), (8, 3)])
-def test_a_pool_of_all_processors_leaves_one_to_the_drivers(
+async def test_a_pool_of_all_processors_leaves_one_to_the_drivers(
     monkeypatch: pytest.MonkeyPatch, processors: int | None, at_once: int
 ) -> None:
     """Otherwise the arm's driver misses its deadlines on a machine with as many simulators as processors."""
     monkeypatch.setattr("os.cpu_count", lambda: processors)
     seen = [0]
-
-    async def check() -> None:
-        bench = laboratory(separate=True)
-        bench.simulators.size = 3
-        ahead = RequestExecutor(bench, {}, Deadlines(), 0.0).speculation
-        ahead.changed = lambda running, waiting: seen.append(running)
-        for seed in range(5):
-            ahead.predict(simulate(seed))
-        await ahead.close()
-
-    asyncio.run(check())
+    bench = laboratory(separate=True)
+    bench.simulators.size = 3
+    ahead = RequestExecutor(bench, {}, Deadlines(), 0.0).speculation
+    ahead.changed = lambda running, waiting: seen.append(running)
+    for seed in range(5):
+        ahead.predict(simulate(seed))
+    await ahead.close()
     assert max(seen) == at_once
 
 
-def test_one_that_is_being_made_is_waited_for_and_not_made_twice() -> None:
-    async def check() -> None:
-        begun: list[int] = []
+async def test_one_that_is_being_made_is_waited_for_and_not_made_twice() -> None:
+    begun: list[int] = []
 
-        async def work(request: Simulate) -> Outcome:
-            begun.append(request.seed)
-            await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
-            return Failed("invalid_action", "cups touch")
+    async def work(request: Simulate) -> Outcome:
+        begun.append(request.seed)
+        await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
+        return Failed("invalid_action", "cups touch")
 
-        ahead = SpeculativeExecution(work, width=1)
-        ahead.predict(simulate(1))
-        assert ahead.knows(simulate(1))
-        assert await ahead.take(simulate(1)) == Failed("invalid_action", "cups touch")
-        assert begun == [1]
-        assert not ahead.knows(simulate(1)), "an outcome is handed out once"
-
-    asyncio.run(check())
+    ahead = SpeculativeExecution(work, width=1)
+    ahead.predict(simulate(1))
+    assert ahead.knows(simulate(1))
+    assert await ahead.take(simulate(1)) == Failed("invalid_action", "cups touch")
+    assert begun == [1]
+    assert not ahead.knows(simulate(1)), "an outcome is handed out once"
 
 
 @pytest.mark.parametrize("outcome", [Failed("simulation", "its worker died"), RuntimeError("a defect")])
-def test_bad_luck_is_not_kept(outcome: Outcome | Exception) -> None:
-    async def check() -> None:
-        async def work(request: Simulate) -> Outcome:
-            if isinstance(outcome, Exception):
-                raise outcome
-            return outcome
+async def test_bad_luck_is_not_kept(outcome: Outcome | Exception) -> None:
+    async def work(request: Simulate) -> Outcome:
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
 
-        ahead = SpeculativeExecution(work, width=1)
-        ahead.predict(simulate(1))
-        await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
-        assert not ahead.knows(simulate(1))
-        ahead.predict(simulate(2))
-        assert await ahead.take(simulate(2)) is None
-
-    asyncio.run(check())
+    ahead = SpeculativeExecution(work, width=1)
+    ahead.predict(simulate(1))
+    await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
+    assert not ahead.knows(simulate(1))
+    ahead.predict(simulate(2))
+    assert await ahead.take(simulate(2)) is None
 
 
 @pytest.mark.slow

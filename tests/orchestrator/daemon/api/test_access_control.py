@@ -37,7 +37,7 @@ from orchestrator.daemon.state.access_tokens import (
 )
 from orchestrator.records.run_registry import enter
 from tests.support.browser import on_port
-from tests.support.toy_daemon import Served, held, run, serving
+from tests.support.toy_daemon import Served, held, serving
 
 LOOKING = (
     *("/status", "/campaigns", "/campaigns/x", "/questions", "/rigs", "/events", "/metrics", "/campaigns/x/report"),
@@ -60,22 +60,19 @@ DOING = (
 )
 
 
-def test_nothing_but_health_is_told_without_a_token_and_viewers_do_nothing(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with serving(tmp_path) as served:
-            for path in LOOKING:
-                assert (await served.http.get(f"/api/v1{path}")).status_code == 401, path
-            for path in (*DOING, "/emergency-stop"):
-                assert (await served.http.post(f"/api/v1{path}", json={})).status_code == 401, path
-            for path in DOING:
-                answer = await served.http.post(f"/api/v1{path}", json={}, headers=served.headers(Role.VIEWER))
-                assert answer.status_code == 403, path
-            assert (await served.http.get("/healthz")).json() == {"ok": True, "problems": []}
-            assert (await served.http.get("/readyz")).status_code in (200, 503)
-            for path in ("/docs", "/openapi.json", "/api/v1/docs", "/redoc"):
-                assert (await served.http.get(path)).status_code == 404
-
-    run(work())
+async def test_nothing_but_health_is_told_without_a_token_and_viewers_do_nothing(tmp_path: Path) -> None:
+    async with serving(tmp_path) as served:
+        for path in LOOKING:
+            assert (await served.http.get(f"/api/v1{path}")).status_code == 401, path
+        for path in (*DOING, "/emergency-stop"):
+            assert (await served.http.post(f"/api/v1{path}", json={})).status_code == 401, path
+        for path in DOING:
+            answer = await served.http.post(f"/api/v1{path}", json={}, headers=served.headers(Role.VIEWER))
+            assert answer.status_code == 403, path
+        assert (await served.http.get("/healthz")).json() == {"ok": True, "problems": []}
+        assert (await served.http.get("/readyz")).status_code in (200, 503)
+        for path in ("/docs", "/openapi.json", "/api/v1/docs", "/redoc"):
+            assert (await served.http.get(path)).status_code == 404
 
 
 def test_every_route_asks_for_a_token(tmp_path: Path) -> None:
@@ -86,21 +83,18 @@ def test_every_route_asks_for_a_token(tmp_path: Path) -> None:
     assert open_to_all == {"/healthz", "/readyz"}
 
 
-def test_wrong_tokens_from_an_address_bar_wrong_ones_and_never_the_right_one(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with serving(tmp_path, held) as served:
-            await served.submit()
-            await served.pouring()
-            for number in range(FAILURES + 2):
-                answer = await served.http.get("/api/v1/status", headers={"Authorization": f"Bearer guess {number}"})
-                assert answer.status_code == (401 if number < FAILURES else 429)
-            assert int(answer.headers["Retry-After"]) <= WINDOW + 1
-            for role in Role:
-                await served.get("/status", role=role)
-            await served.post("/emergency-stop", role=Role.VIEWER)
-            assert served.laboratories[0].arm_stops == 1
-
-    run(work())
+async def test_wrong_tokens_from_an_address_bar_wrong_ones_and_never_the_right_one(tmp_path: Path) -> None:
+    async with serving(tmp_path, held) as served:
+        await served.submit()
+        await served.pouring()
+        for number in range(FAILURES + 2):
+            answer = await served.http.get("/api/v1/status", headers={"Authorization": f"Bearer guess {number}"})
+            assert answer.status_code == (401 if number < FAILURES else 429)
+        assert int(answer.headers["Retry-After"]) <= WINDOW + 1
+        for role in Role:
+            await served.get("/status", role=role)
+        await served.post("/emergency-stop", role=Role.VIEWER)
+        assert served.laboratories[0].arm_stops == 1
 
 
 def test_guesses_are_forgotten_after_a_while_and_do_not_bar_others(tmp_path: Path) -> None:
@@ -142,46 +136,43 @@ def test_a_bad_line_has_no_effect_and_the_others_have_theirs(tmp_path: Path) -> 
     assert Tokens(path).find(good) is not None
 
 
-def test_tokens_are_added_expired_and_revoked_while_the_daemon_runs(
+async def test_tokens_are_added_expired_and_revoked_while_the_daemon_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def work() -> None:
-        async with serving(tmp_path) as served:
-            state = ["--state", str(served.daemon.settings.state)]
+    async with serving(tmp_path) as served:
+        state = ["--state", str(served.daemon.settings.state)]
 
-            def token(*arguments: str, code: int = 0) -> str:
-                result = CliRunner().invoke(app, ["server", "token", *arguments, *state])
-                assert result.exit_code == code, result.output
-                return result.stdout.strip() or result.stderr
+        def token(*arguments: str, code: int = 0) -> str:
+            result = CliRunner().invoke(app, ["server", "token", *arguments, *state])
+            assert result.exit_code == code, result.output
+            return result.stdout.strip() or result.stderr
 
-            async def status(secret: str) -> httpx.Response:
-                return await served.http.get("/api/v1/status", headers={"Authorization": f"Bearer {secret}"})
+        async def status(secret: str) -> httpx.Response:
+            return await served.http.get("/api/v1/status", headers={"Authorization": f"Bearer {secret}"})
 
-            anna, screen = token("add", "operator", "anna"), token("add", "viewer", "screen", "--days", "2")
-            assert (await status(anna)).json()["person"] == {"name": "anna", "role": "operator"}
-            assert (await status(screen)).json()["person"] == {"name": "screen", "role": "viewer"}
-            assert "revoke it first" in token("add", "viewer", "anna", code=2)
-            assert "is no name" in token("add", "viewer", "an na", code=2)
-            text = served.daemon.settings.tokens.read_text()
-            assert anna not in text
-            assert "sha256:" in text
-            shown = token("list")
-            assert "operator  anna" in shown
-            assert "in plain text" in shown.splitlines()[0]
-            now = time.time()
-            with monkeypatch.context() as later:
-                later.setattr("orchestrator.daemon.state.access_tokens.time.time", lambda: now + 3 * 86_400)
-                assert (await status(screen)).status_code == 401
-                assert (await status(anna)).status_code == 200
-            token("revoke", "anna")
-            assert (await status(anna)).status_code == 401
-            assert "there is no token of anna" in token("revoke", "anna", code=2)
-            with served.daemon.settings.tokens.open("a") as file:
-                file.write("operator tablet short\n")
-            problems = (await served.get("/status"))["problems"]
-            assert any("this line has no effect" in problem for problem in problems)
-
-    run(work())
+        anna, screen = token("add", "operator", "anna"), token("add", "viewer", "screen", "--days", "2")
+        assert (await status(anna)).json()["person"] == {"name": "anna", "role": "operator"}
+        assert (await status(screen)).json()["person"] == {"name": "screen", "role": "viewer"}
+        assert "revoke it first" in token("add", "viewer", "anna", code=2)
+        assert "is no name" in token("add", "viewer", "an na", code=2)
+        text = served.daemon.settings.tokens.read_text()
+        assert anna not in text
+        assert "sha256:" in text
+        shown = token("list")
+        assert "operator  anna" in shown
+        assert "in plain text" in shown.splitlines()[0]
+        now = time.time()
+        with monkeypatch.context() as later:
+            later.setattr("orchestrator.daemon.state.access_tokens.time.time", lambda: now + 3 * 86_400)
+            assert (await status(screen)).status_code == 401
+            assert (await status(anna)).status_code == 200
+        token("revoke", "anna")
+        assert (await status(anna)).status_code == 401
+        assert "there is no token of anna" in token("revoke", "anna", code=2)
+        with served.daemon.settings.tokens.open("a") as file:
+            file.write("operator tablet short\n")
+        problems = (await served.get("/status"))["problems"]
+        assert any("this line has no effect" in problem for problem in problems)
 
 
 def test_a_file_that_others_may_read_by_now_changes_nothing(tmp_path: Path) -> None:
@@ -196,28 +187,24 @@ def test_a_file_that_others_may_read_by_now_changes_nothing(tmp_path: Path) -> N
     assert tokens.problems == []
 
 
-def test_the_local_command_line_acts_as_the_local_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_local_command_line_acts_as_the_local_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DECANT_TOKEN", raising=False)
     monkeypatch.setenv("LOGNAME", "ada")
-
-    async def work() -> None:
-        async with serving(tmp_path) as served:
-            state = served.daemon.settings.state
-            with (state / "tokens").open("a") as file:
-                file.write(f"admin boss {'x' * 30}\n")
-            with Client("http://127.0.0.1:1", state) as client:
-                headers = client._http.headers
-            for name, recorded in (("ada", "ada (local)"), ("a\nb", "somebody (local)")):
-                sent = {"Authorization": headers["Authorization"], "Decant-User": name.replace("\n", " ")}
-                answer = await served.http.post("/api/v1/queue/pause", headers=sent)
-                assert answer.json()["person"] == {"name": recorded, "role": "admin"}
-                assert served.daemon.store.audit(limit=1)[0]["by"] == recorded
-            assert headers["Decant-User"] == "ada"
-            # the header of somebody with a token of their own changes nothing
-            sent = {**served.headers(Role.OPERATOR), "Decant-User": "boss"}
-            assert (await served.http.get("/api/v1/status", headers=sent)).json()["person"]["name"] == "operator"
-
-    run(work())
+    async with serving(tmp_path) as served:
+        state = served.daemon.settings.state
+        with (state / "tokens").open("a") as file:
+            file.write(f"admin boss {'x' * 30}\n")
+        with Client("http://127.0.0.1:1", state) as client:
+            headers = client._http.headers
+        for name, recorded in (("ada", "ada (local)"), ("a\nb", "somebody (local)")):
+            sent = {"Authorization": headers["Authorization"], "Decant-User": name.replace("\n", " ")}
+            answer = await served.http.post("/api/v1/queue/pause", headers=sent)
+            assert answer.json()["person"] == {"name": recorded, "role": "admin"}
+            assert served.daemon.store.audit(limit=1)[0]["by"] == recorded
+        assert headers["Decant-User"] == "ada"
+        # the header of somebody with a token of their own changes nothing
+        sent = {**served.headers(Role.OPERATOR), "Decant-User": "boss"}
+        assert (await served.http.get("/api/v1/status", headers=sent)).json()["person"]["name"] == "operator"
 
 
 def first_run(state: Path) -> None:
@@ -266,16 +253,13 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
         pytest.param("\x00\x01", "not YAML", id="not text"),
     ],
 )
-def test_what_is_submitted_neither_looks_elsewhere_nor_blows_up(tmp_path: Path, text: str, said: str) -> None:
-    async def work() -> None:
-        async with serving(tmp_path) as served:
-            told = await served.post("/campaigns", {"text": text}, status=422)
-            assert said in told["detail"]
-            assert "daemon:" not in told["detail"], "a file's content was shown"
-            assert_no_place_of_the_server(told["detail"], tmp_path)
-            assert list((tmp_path / "state/campaigns").iterdir()) == []
-
-    run(work())
+async def test_what_is_submitted_neither_looks_elsewhere_nor_blows_up(tmp_path: Path, text: str, said: str) -> None:
+    async with serving(tmp_path) as served:
+        told = await served.post("/campaigns", {"text": text}, status=422)
+        assert said in told["detail"]
+        assert "daemon:" not in told["detail"], "a file's content was shown"
+        assert_no_place_of_the_server(told["detail"], tmp_path)
+        assert list((tmp_path / "state/campaigns").iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -300,37 +284,30 @@ def test_files_go_nowhere_but_into_the_snapshot(tmp_path: Path, name: str) -> No
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_link_in_a_root_does_not_lead_out_of_it(tmp_path: Path) -> None:
+async def test_a_link_in_a_root_does_not_lead_out_of_it(tmp_path: Path) -> None:
     root = tmp_path / "root"
     root.mkdir()
     outside = tmp_path / "outside.yaml"
     outside.write_text("name: secret\n")
     (root / "link.yaml").symlink_to(outside)
     (root / "refers.yaml").write_text("name: x\npourer: ../outside.yaml\nlaboratory: link.yaml\nseed: 1\n")
-
-    async def work() -> None:
-        async with serving(tmp_path, roots=(root,)) as served:
-            for path in ("link.yaml", "../outside.yaml", str(outside), "nothing.yaml", "/etc/passwd"):
-                told = await served.post("/campaigns", {"path": path}, status=422)
-                assert "no such campaign in the folders that may be read" in told["detail"], path
-            told = await served.post("/campaigns", {"path": "refers.yaml"}, status=422)
-            assert told["detail"].count("lies outside") == 2
-            assert_no_place_of_the_server(told["detail"], tmp_path)
-            assert "secret" not in told["detail"]
-
-    run(work())
+    async with serving(tmp_path, roots=(root,)) as served:
+        for path in ("link.yaml", "../outside.yaml", str(outside), "nothing.yaml", "/etc/passwd"):
+            told = await served.post("/campaigns", {"path": path}, status=422)
+            assert "no such campaign in the folders that may be read" in told["detail"], path
+        told = await served.post("/campaigns", {"path": "refers.yaml"}, status=422)
+        assert told["detail"].count("lies outside") == 2
+        assert_no_place_of_the_server(told["detail"], tmp_path)
+        assert "secret" not in told["detail"]
 
 
-def test_a_disk_error_is_refused_without_paths_of_the_server(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with serving(tmp_path) as served:
-            snapshots = tmp_path / "state/campaigns"
-            snapshots.rmdir()
-            snapshots.symlink_to(tmp_path / "nothing" / "there")
-            told = await served.post("/campaigns", {"text": "name: x\nseed: 1\n"}, status=422)
-            assert_no_place_of_the_server(told["detail"], tmp_path)
-
-    run(work())
+async def test_a_disk_error_is_refused_without_paths_of_the_server(tmp_path: Path) -> None:
+    async with serving(tmp_path) as served:
+        snapshots = tmp_path / "state/campaigns"
+        snapshots.rmdir()
+        snapshots.symlink_to(tmp_path / "nothing" / "there")
+        told = await served.post("/campaigns", {"text": "name: x\nseed: 1\n"}, status=422)
+        assert_no_place_of_the_server(told["detail"], tmp_path)
 
 
 def assert_no_place_of_the_server(text: str, folder: Path) -> None:
@@ -338,30 +315,24 @@ def assert_no_place_of_the_server(text: str, folder: Path) -> None:
         assert str(place) not in text, text
 
 
-def test_a_campaign_in_a_root_is_submitted_by_its_path(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with serving(tmp_path, roots=(tmp_path,)) as served:
-            key = (await served.post("/campaigns", {"path": "small.yaml"}))["id"]
-            await served.until(key, "finished")
-
-    run(work())
+async def test_a_campaign_in_a_root_is_submitted_by_its_path(tmp_path: Path) -> None:
+    async with serving(tmp_path, roots=(tmp_path,)) as served:
+        key = (await served.post("/campaigns", {"path": "small.yaml"}))["id"]
+        await served.until(key, "finished")
 
 
-def test_ten_megabytes_are_not_read(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with serving(tmp_path) as served:
-            text = "x" * 10_000_000
-            told = await served.post("/campaigns", {"text": text}, status=413)
-            assert told["detail"] == "more than 4 MB are not read"
+async def test_ten_megabytes_are_not_read(tmp_path: Path) -> None:
+    async with serving(tmp_path) as served:
+        text = "x" * 10_000_000
+        told = await served.post("/campaigns", {"text": text}, status=413)
+        assert told["detail"] == "more than 4 MB are not read"
 
-            async def pieces() -> Any:  # of unknown length
-                for _ in range(100):
-                    yield b"x" * 100_000
+        async def pieces() -> Any:  # of unknown length
+            for _ in range(100):
+                yield b"x" * 100_000
 
-            answer = await served.http.post("/api/v1/campaigns", headers=served.headers(), content=pieces())
-            assert answer.status_code == 413
-
-    run(work())
+        answer = await served.http.post("/api/v1/campaigns", headers=served.headers(), content=pieces())
+        assert answer.status_code == 413
 
 
 @pytest.mark.parametrize("known_length", [True, False])
@@ -393,20 +364,17 @@ def test_a_client_that_waits_for_100_continue_is_refused_at_once(tmp_path: Path)
                 assert answer.read().startswith(b"HTTP/1.1 413 ")  # to the end: the connection is closed, too
 
 
-def test_another_name_for_this_machine_is_not_answered(tmp_path: Path) -> None:
+async def test_another_name_for_this_machine_is_not_answered(tmp_path: Path) -> None:
     async def ask(served: Served, host: str) -> int:
         answer = await served.http.get("/healthz", headers={"Host": host})
         return answer.status_code
 
-    async def work() -> None:
-        async with serving(tmp_path) as served:
-            for host in ("localhost:8377", "127.0.0.1", "[::1]:1", "[::1]"):
-                assert await ask(served, host) == 200, host
-            for host in ("evil.example", "evil.example:8377", "127.0.0.1.evil.example", ""):
-                assert await ask(served, host) == 421, host
-            answer = await served.http.options(
-                "/api/v1/status", headers={"Origin": "http://evil.example", "Access-Control-Request-Method": "GET"}
-            )
-            assert "access-control-allow-origin" not in answer.headers
-
-    run(work())
+    async with serving(tmp_path) as served:
+        for host in ("localhost:8377", "127.0.0.1", "[::1]:1", "[::1]"):
+            assert await ask(served, host) == 200, host
+        for host in ("evil.example", "evil.example:8377", "127.0.0.1.evil.example", ""):
+            assert await ask(served, host) == 421, host
+        answer = await served.http.options(
+            "/api/v1/status", headers={"Origin": "http://evil.example", "Access-Control-Request-Method": "GET"}
+        )
+        assert "access-control-allow-origin" not in answer.headers

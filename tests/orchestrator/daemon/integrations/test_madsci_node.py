@@ -22,7 +22,7 @@ from orchestrator.daemon.state.daemon_settings import MadsciSettings
 from tests.support.other_environments import line, python_with, running, told
 from tests.support.station import order, rigs_in, set_up, until_pour
 from tests.support.station_process import node_process, station_process
-from tests.support.toy_daemon import Served, held, run, serving
+from tests.support.toy_daemon import Served, held, serving
 from tests.support.waiting import PATIENCE, wait_for
 
 ARGS = {
@@ -53,169 +53,156 @@ async def created(http: httpx.AsyncClient, name: str = "pour", **changes: Any) -
     return str(answer.json()["action_id"])
 
 
-def test_a_started_action_is_poured_once_however_often_its_start_is_repeated(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with serving(tmp_path, held, rigs=rigs_in(tmp_path)) as served:
-            await set_up(served)
-            async with node(served) as http:
-                info = (await http.get("/info")).json()
-                assert len(info["node_id"]) == len(new_ulid()) == 26
-                assert set(info["actions"]) == {"pour", "predict_pour", "run_campaign"}
-                key = await created(http)
-                assert (await http.get(f"/action/pour/{key}/status")).json() == "not_started"
-                for _ in range(3):
-                    assert (await http.post(f"/action/pour/{key}/start")).json()["status"] == "running"
-                await served.pouring()
-                assert (await http.get("/status")).json()["running_actions"] == [key]
-                served.laboratories[0].bench.go.set()
-                found = await until_pour(served, key, "weighed")
-                result = (await http.post(f"/action/pour/{key}/start")).json()
-                assert result["status"] == "succeeded"
-                assert result["json_result"]["result"]["received_g"] == found["result"]["received_g"]
-                assert len(served.laboratories[0].bench.poured) == 1
-                history = (await http.get("/action", params={"action_id": key})).json()
-                assert history[key][0]["status"] == "succeeded"
-                wrong = await created(http, source="nothing")
-                refused = (await http.post(f"/action/pour/{wrong}/start")).json()
-                assert refused["status"] == "failed"
-                assert "there is no vessel 'nothing'" in refused["errors"][0]["message"]
-        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
-            assert (await http.get("/info")).json()["node_id"] == info["node_id"]
-            assert (await http.get(f"/action/{key}/result")).json()["status"] == "succeeded"
-
-    run(work())
+async def test_a_started_action_is_poured_once_however_often_its_start_is_repeated(tmp_path: Path) -> None:
+    async with serving(tmp_path, held, rigs=rigs_in(tmp_path)) as served:
+        await set_up(served)
+        async with node(served) as http:
+            info = (await http.get("/info")).json()
+            assert len(info["node_id"]) == len(new_ulid()) == 26
+            assert set(info["actions"]) == {"pour", "predict_pour", "run_campaign"}
+            key = await created(http)
+            assert (await http.get(f"/action/pour/{key}/status")).json() == "not_started"
+            for _ in range(3):
+                assert (await http.post(f"/action/pour/{key}/start")).json()["status"] == "running"
+            await served.pouring()
+            assert (await http.get("/status")).json()["running_actions"] == [key]
+            served.laboratories[0].bench.go.set()
+            found = await until_pour(served, key, "weighed")
+            result = (await http.post(f"/action/pour/{key}/start")).json()
+            assert result["status"] == "succeeded"
+            assert result["json_result"]["result"]["received_g"] == found["result"]["received_g"]
+            assert len(served.laboratories[0].bench.poured) == 1
+            history = (await http.get("/action", params={"action_id": key})).json()
+            assert history[key][0]["status"] == "succeeded"
+            wrong = await created(http, source="nothing")
+            refused = (await http.post(f"/action/pour/{wrong}/start")).json()
+            assert refused["status"] == "failed"
+            assert "there is no vessel 'nothing'" in refused["errors"][0]["message"]
+    async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
+        assert (await http.get("/info")).json()["node_id"] == info["node_id"]
+        assert (await http.get(f"/action/{key}/result")).json()["status"] == "succeeded"
 
 
-def test_admin_commands_stop_and_hold_the_node_and_only_a_person_clears_a_stop(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with serving(tmp_path, held, rigs=rigs_in(tmp_path)) as served:
-            await set_up(served)
-            async with node(served) as http:
+async def test_admin_commands_stop_and_hold_the_node_and_only_a_person_clears_a_stop(tmp_path: Path) -> None:
+    async with serving(tmp_path, held, rigs=rigs_in(tmp_path)) as served:
+        await set_up(served)
+        async with node(served) as http:
 
-                async def admin(command: str) -> Any:
-                    return (await http.post(f"/admin/{command}")).json()
+            async def admin(command: str) -> Any:
+                return (await http.post(f"/admin/{command}")).json()
 
-                assert (await admin("AdminCommands.LOCK"))["success"]
-                key = await created(http)
-                refused = (await http.post(f"/action/pour/{key}/start")).json()
-                assert refused["status"] == "not_ready"
-                assert refused["errors"][0]["message"] == "the node is locked"
-                assert (await admin("unlock"))["success"]
-                await http.post(f"/action/pour/{key}/start")
-                laboratory = await served.pouring()
-                waiting = await created(http, receiver="vial-2")
-                await http.post(f"/action/pour/{waiting}/start")
-                assert (await admin("safety_stop"))["success"]
-                assert laboratory.arm_stops == 1
-                await until_pour(served, key, "unknown")
-                assert (await http.get(f"/action/{key}/status")).json() == "unknown"
-                assert not (await http.get("/status")).json()["ready"]
-                assert "administrator" in (await admin("reset"))["errors"][0]["message"]
-                assert not (await admin("shutdown"))["success"]
-                assert (await admin("cancel"))["success"]
-                assert (await http.get(f"/action/{waiting}/status")).json() == "cancelled"
-                await served.post("/emergency-stop/clear", role=Role.ADMIN)
-                assert (await admin("reset"))["success"]
-                await admin("lock")
-        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
-            assert (await http.get("/status")).json()["locked"]
-
-    run(work())
+            assert (await admin("AdminCommands.LOCK"))["success"]
+            key = await created(http)
+            refused = (await http.post(f"/action/pour/{key}/start")).json()
+            assert refused["status"] == "not_ready"
+            assert refused["errors"][0]["message"] == "the node is locked"
+            assert (await admin("unlock"))["success"]
+            await http.post(f"/action/pour/{key}/start")
+            laboratory = await served.pouring()
+            waiting = await created(http, receiver="vial-2")
+            await http.post(f"/action/pour/{waiting}/start")
+            assert (await admin("safety_stop"))["success"]
+            assert laboratory.arm_stops == 1
+            await until_pour(served, key, "unknown")
+            assert (await http.get(f"/action/{key}/status")).json() == "unknown"
+            assert not (await http.get("/status")).json()["ready"]
+            assert "administrator" in (await admin("reset"))["errors"][0]["message"]
+            assert not (await admin("shutdown"))["success"]
+            assert (await admin("cancel"))["success"]
+            assert (await http.get(f"/action/{waiting}/status")).json() == "cancelled"
+            await served.post("/emergency-stop/clear", role=Role.ADMIN)
+            assert (await admin("reset"))["success"]
+            await admin("lock")
+    async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
+        assert (await http.get("/status")).json()["locked"]
 
 
 def messages(found: dict[str, Any]) -> str:
     return "; ".join(one["message"] for one in found["errors"])
 
 
-def test_an_action_whose_order_was_stored_when_the_daemon_was_killed_is_started(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
-            await set_up(served)
-            await served.post("/queue/pause")
-            unsent = await created(http)
-            key = await created(http)
-            await ordering(served).pour(PourIn.model_validate({**ARGS, "id": key}), PERSON)
-        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
-            found = (await http.get(f"/action/{unsent}/result")).json()
-            assert found["status"] == "not_started"
-            assert "nothing moved" in messages(found)
-            for answer in (await http.get(f"/action/{key}/result"), await http.post(f"/action/pour/{key}/start")):
-                assert answer.json()["status"] == "running"
-                assert "the queue is paused" in messages(answer.json())
-            campaign = (await served.get(f"/pours/{key}"))["campaign"]
-            served.daemon.store.change(campaign, mode="hardware")
-            found = (await http.get(f"/action/{key}/result")).json()
-            assert found["status"] == "running"
-            assert f"decant queue enable {campaign}" in messages(found)
-            served.daemon.store.change(campaign, mode="virtual")
-            await http.post("/admin/resume")
-            pour = await until_pour(served, key, "weighed")
-            found = (await http.get(f"/action/{key}/result")).json()
-            assert found["status"] == "succeeded"
-            assert found["json_result"]["result"]["received_g"] == pour["result"]["received_g"]
-            assert len(await served.get("/pours")) == 1
-
-    run(work())
+async def test_an_action_whose_order_was_stored_when_the_daemon_was_killed_is_started(tmp_path: Path) -> None:
+    async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
+        await set_up(served)
+        await served.post("/queue/pause")
+        unsent = await created(http)
+        key = await created(http)
+        await ordering(served).pour(PourIn.model_validate({**ARGS, "id": key}), PERSON)
+    async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
+        found = (await http.get(f"/action/{unsent}/result")).json()
+        assert found["status"] == "not_started"
+        assert "nothing moved" in messages(found)
+        for answer in (await http.get(f"/action/{key}/result"), await http.post(f"/action/pour/{key}/start")):
+            assert answer.json()["status"] == "running"
+            assert "the queue is paused" in messages(answer.json())
+        campaign = (await served.get(f"/pours/{key}"))["campaign"]
+        served.daemon.store.change(campaign, mode="hardware")
+        found = (await http.get(f"/action/{key}/result")).json()
+        assert found["status"] == "running"
+        assert f"decant queue enable {campaign}" in messages(found)
+        served.daemon.store.change(campaign, mode="virtual")
+        await http.post("/admin/resume")
+        pour = await until_pour(served, key, "weighed")
+        found = (await http.get(f"/action/{key}/result")).json()
+        assert found["status"] == "succeeded"
+        assert found["json_result"]["result"]["received_g"] == pour["result"]["received_g"]
+        assert len(await served.get("/pours")) == 1
 
 
 @pytest.mark.parametrize("answer", ["weighed 2 60", "cancel"])
-def test_a_pour_without_outcome_states_what_has_to_be_done_until_it_is_settled(tmp_path: Path, answer: str) -> None:
-    async def work() -> None:
-        async with serving(tmp_path, held, rigs=rigs_in(tmp_path)) as served, node(served) as http:
-            await set_up(served)
-            key = await created(http)
-            await http.post(f"/action/pour/{key}/start")
-            await served.pouring()
-            campaign = (await served.get(f"/pours/{key}"))["campaign"]
-            await http.post("/admin/safety_stop")
-            await served.until(campaign, "unknown", "paused")
-        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
+async def test_a_pour_without_outcome_states_what_has_to_be_done_until_it_is_settled(
+    tmp_path: Path, answer: str
+) -> None:
+    async with serving(tmp_path, held, rigs=rigs_in(tmp_path)) as served, node(served) as http:
+        await set_up(served)
+        key = await created(http)
+        await http.post(f"/action/pour/{key}/start")
+        await served.pouring()
+        campaign = (await served.get(f"/pours/{key}"))["campaign"]
+        await http.post("/admin/safety_stop")
+        await served.until(campaign, "unknown", "paused")
+    async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
 
-            async def told(act: str) -> None:
-                found = (await http.get(f"/action/{key}/result")).json()
-                assert found["status"] == "unknown"
-                assert "the outcome is unknown" in messages(found)
-                assert act in messages(found)
-                assert act in messages((await http.get("/status")).json())
+        async def told(act: str) -> None:
+            found = (await http.get(f"/action/{key}/result")).json()
+            assert found["status"] == "unknown"
+            assert "the outcome is unknown" in messages(found)
+            assert act in messages(found)
+            assert act in messages((await http.get("/status")).json())
 
-            await told("decant estop --clear")
-            await served.post("/emergency-stop/clear", role=Role.ADMIN)
-            await told(f"decant queue resume {campaign}")
-            other = await created(http, receiver="vial-2")
-            refused = (await http.post(f"/action/pour/{other}/start")).json()
-            assert refused["status"] == "failed"
-            assert f"pour {key} has begun and has no outcome" in messages(refused)
-            await served.post(f"/campaigns/{campaign}/resume")
-            question = (await served.question())["id"]
-            await until_pour(served, key, "unknown")
-            await told(f"decant queue answer {question}")
-            if answer == "cancel":
-                await http.post("/admin/cancel")
-                await served.until(campaign, "stopped")
-                found = (await http.get(f"/action/{key}/result")).json()
-                assert found["status"] == "failed"  # final: the client waits for ever for an 'unknown' action
-                assert "weigh beaker and vial-1" in messages(found)
-            else:
-                await served.post(f"/questions/{question}/answer", {"answer": answer})
-                await until_pour(served, key, "weighed")
-                found = (await http.get(f"/action/{key}/result")).json()
-                assert found["status"] == "succeeded"
-                assert found["json_result"]["result"]["received_g"] == pytest.approx(38.0)
-            assert (await http.get("/status")).json()["errors"] == []
-            assert sum(len(one.bench.poured) for one in served.laboratories) == 0
-
-    run(work())
+        await told("decant estop --clear")
+        await served.post("/emergency-stop/clear", role=Role.ADMIN)
+        await told(f"decant queue resume {campaign}")
+        other = await created(http, receiver="vial-2")
+        refused = (await http.post(f"/action/pour/{other}/start")).json()
+        assert refused["status"] == "failed"
+        assert f"pour {key} has begun and has no outcome" in messages(refused)
+        await served.post(f"/campaigns/{campaign}/resume")
+        question = (await served.question())["id"]
+        await until_pour(served, key, "unknown")
+        await told(f"decant queue answer {question}")
+        if answer == "cancel":
+            await http.post("/admin/cancel")
+            await served.until(campaign, "stopped")
+            found = (await http.get(f"/action/{key}/result")).json()
+            assert found["status"] == "failed"  # final: the client waits for ever for an 'unknown' action
+            assert "weigh beaker and vial-1" in messages(found)
+        else:
+            await served.post(f"/questions/{question}/answer", {"answer": answer})
+            await until_pour(served, key, "weighed")
+            found = (await http.get(f"/action/{key}/result")).json()
+            assert found["status"] == "succeeded"
+            assert found["json_result"]["result"]["received_g"] == pytest.approx(38.0)
+        assert (await http.get("/status")).json()["errors"] == []
+        assert sum(len(one.bench.poured) for one in served.laboratories) == 0
 
 
-def test_an_address_that_is_not_listed_reaches_nothing(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served, "10.1.1.1") as http:
-            for path in ("/info", "/status"):
-                assert (await http.get(path)).status_code == 403
-            assert (await http.post("/admin/safety_stop")).status_code == 403
-            assert served.supervisor.stops.of_all is None
-
-    run(work())
+async def test_an_address_that_is_not_listed_reaches_nothing(tmp_path: Path) -> None:
+    async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served, "10.1.1.1") as http:
+        for path in ("/info", "/status"):
+            assert (await http.get(path)).status_code == 403
+        assert (await http.post("/admin/safety_stop")).status_code == 403
+        assert served.supervisor.stops.of_all is None
 
 
 CLIENT = """
@@ -368,17 +355,14 @@ def poured(folder: Path) -> int:
     return len(path.read_text().splitlines()) if path.exists() else 0
 
 
-def test_an_order_of_the_api_and_one_of_the_node_share_the_account(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served:
-            await set_up(served)
-            await served.post("/queue/pause")
-            await served.post("/pours", order("mine", amount="60 g"))
-            async with node(served) as http:
-                assert (await http.get("/status")).json()["paused"]
-                await served.post("/queue/resume")
-                key = await created(http, amount="60 g", receiver="vial-2")
-                refused = (await http.post(f"/action/pour/{key}/start")).json()
-                assert refused["status"] == "failed"
-
-    run(work())
+async def test_an_order_of_the_api_and_one_of_the_node_share_the_account(tmp_path: Path) -> None:
+    async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served:
+        await set_up(served)
+        await served.post("/queue/pause")
+        await served.post("/pours", order("mine", amount="60 g"))
+        async with node(served) as http:
+            assert (await http.get("/status")).json()["paused"]
+            await served.post("/queue/resume")
+            key = await created(http, amount="60 g", receiver="vial-2")
+            refused = (await http.post(f"/action/pour/{key}/start")).json()
+            assert refused["status"] == "failed"

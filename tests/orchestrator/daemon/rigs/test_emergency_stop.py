@@ -31,7 +31,7 @@ from tests.orchestrator.daemon.integrations.test_sila_server import needs_cdk, s
 from tests.support.browser import OnPort, on_port
 from tests.support.hypothesis_examples import examples
 from tests.support.stop_requests import CASES, FORMS, PATH, StopCase, connected, head_of, response, sent, stopped_by
-from tests.support.toy_daemon import CAMPAIGN, held, run, serving
+from tests.support.toy_daemon import CAMPAIGN, held, serving
 from tests.support.waiting import PATIENCE, wait_for
 
 DECANT = [sys.executable, "-c", "from orchestrator.cli.app import main; main()"]
@@ -287,60 +287,50 @@ def test_one_of_several_rigs_is_stopped_if_the_query_names_it_and_all_otherwise(
             assert not pair.served.daemon.workers["right"].latched
 
 
-def test_the_stop_of_one_rig_is_latched_and_cleared_by_itself(tmp_path: Path) -> None:
+async def test_the_stop_of_one_rig_is_latched_and_cleared_by_itself(tmp_path: Path) -> None:
     (rig, _) = two_rigs(tmp_path)
-
-    async def work() -> None:
-        async with serving(tmp_path, held, rigs=(rig,)) as served:
-            found = await served.post("/emergency-stop?rig=left&reason=glass")
-            (stopped_rig,) = [one for one in found["rigs"] if one["name"] == "left"]
-            assert stopped_rig["emergency"]["reason"] == "glass"
-            await served.post("/emergency-stop/clear", {"rig": "left"}, role=Role.ADMIN)
-            assert (await served.get("/status"))["emergency"] is None
-
-    run(work())
+    async with serving(tmp_path, held, rigs=(rig,)) as served:
+        found = await served.post("/emergency-stop?rig=left&reason=glass")
+        (stopped_rig,) = [one for one in found["rigs"] if one["name"] == "left"]
+        assert stopped_rig["emergency"]["reason"] == "glass"
+        await served.post("/emergency-stop/clear", {"rig": "left"}, role=Role.ADMIN)
+        assert (await served.get("/status"))["emergency"] is None
 
 
-def test_stops_at_once_keep_all_authors_and_reasons(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with serving(tmp_path, held) as served:
-            await served.submit()
-            laboratory = await served.pouring()
-            people = (Role.VIEWER, "glass"), (Role.ADMIN, "smoke")
-            await asyncio.gather(*(served.post(f"/emergency-stop?reason={why}", role=role) for role, why in people))
-            assert laboratory.arm_stops == 2  # the second order reaches an arm that did not take the first one
-            found = (await served.get("/status"))["emergency"]
-            assert sorted(found["by"].split(", ")) == ["admin", "viewer"]
-            assert sorted(found["reason"].split("; ")) == ["glass", "smoke"]
-            await served.post("/emergency-stop?reason=glass", role=Role.VIEWER)
-            assert (await served.get("/status"))["emergency"] == found
-            entries = [one for one in served.daemon.store.audit() if one["what"] == "emergency stop"]
-            assert sorted((one["by"], one["detail"]) for one in entries) == [
-                ("admin", "smoke"), ("viewer", "glass"), ("viewer", "glass"),
-            ]  # fmt: skip
-
-    run(work())
+async def test_stops_at_once_keep_all_authors_and_reasons(tmp_path: Path) -> None:
+    async with serving(tmp_path, held) as served:
+        await served.submit()
+        laboratory = await served.pouring()
+        people = (Role.VIEWER, "glass"), (Role.ADMIN, "smoke")
+        await asyncio.gather(*(served.post(f"/emergency-stop?reason={why}", role=role) for role, why in people))
+        assert laboratory.arm_stops == 2  # the second order reaches an arm that did not take the first one
+        found = (await served.get("/status"))["emergency"]
+        assert sorted(found["by"].split(", ")) == ["admin", "viewer"]
+        assert sorted(found["reason"].split("; ")) == ["glass", "smoke"]
+        await served.post("/emergency-stop?reason=glass", role=Role.VIEWER)
+        assert (await served.get("/status"))["emergency"] == found
+        entries = [one for one in served.daemon.store.audit() if one["what"] == "emergency stop"]
+        assert sorted((one["by"], one["detail"]) for one in entries) == [
+            ("admin", "smoke"), ("viewer", "glass"), ("viewer", "glass"),
+        ]  # fmt: skip
 
 
-def test_a_disk_that_cannot_be_used_prevents_no_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_disk_that_cannot_be_used_prevents_no_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*arguments: Any) -> Any:
         raise StoreError("the disk is full")
 
-    async def work() -> None:
-        async with serving(tmp_path, held) as served:
-            await served.submit()
-            laboratory = await served.pouring()
-            with monkeypatch.context() as patch:
-                for name in ("set_flag", "flag", "note", "questions", "items", "change"):
-                    patch.setattr(served.daemon.store, name, full)
-                found = await served.post("/emergency-stop")
-                assert laboratory.arm_stops == 1
-                assert "the state of the daemon can't be read: see its log" in found["notes"]
-                async with node(served) as http:
-                    assert (await http.post("/admin/safety_stop")).status_code == 200
-                assert laboratory.arm_stops == 2
-
-    run(work())
+    async with serving(tmp_path, held) as served:
+        await served.submit()
+        laboratory = await served.pouring()
+        with monkeypatch.context() as patch:
+            for name in ("set_flag", "flag", "note", "questions", "items", "change"):
+                patch.setattr(served.daemon.store, name, full)
+            found = await served.post("/emergency-stop")
+            assert laboratory.arm_stops == 1
+            assert "the state of the daemon can't be read: see its log" in found["notes"]
+            async with node(served) as http:
+                assert (await http.post("/admin/safety_stop")).status_code == 200
+            assert laboratory.arm_stops == 2
 
 
 @pytest.mark.parametrize("reason", ["x" * 10_000, "\ud800\x00", None, 5, {1, 2}, [[]] * 3])

@@ -12,7 +12,7 @@ from actors.interfaces import OperatorQuestion
 from orchestrator.cli import queue_commands
 from orchestrator.daemon.state.access_tokens import Role
 from tests.support.cli_inputs import invoke
-from tests.support.toy_daemon import HeldLaboratory, run, serving
+from tests.support.toy_daemon import HeldLaboratory, serving
 
 REFILL = OperatorQuestion("Refill the beaker to 100 g.", "done", about="refill", details={"load": 100.0})
 WEIGH = OperatorQuestion(
@@ -43,80 +43,67 @@ def with_person(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_step_at_the_bench_is_asked_and_the_first_answer_counts(with_person: Path) -> None:
-    async def work() -> None:
-        async with serving(with_person, asking(REFILL)) as served:
-            key = await served.submit()
-            question = await served.question()
-            assert {name: question[name] for name in ("campaign", "kind", "text", "wants", "hands", "details")} == {
-                "campaign": key,
-                "kind": "bench",
-                "text": REFILL.text,
-                "wants": "done",
-                "hands": True,
-                "details": {"load": 100.0},
-            }
-            where = f"/questions/{question['id']}/answer"
-            wrong = await served.post(where, {"answer": "yes"}, status=422)
-            assert wrong["detail"] == "'yes' is not an answer; answer with 'done' when it is done, or 'give up'"
-            await served.post(where, {"answer": "done"}, role=Role.VIEWER, status=403)
-            told = await served.post(where, {"answer": " Done "})
-            assert (told["answer"], told["by"], told["open"]) == ("done", "operator", False)
-            late = await served.post(where, {"answer": "done"}, status=404)
-            assert late["detail"] == f"question {question['id']} is not open"
-            second = await served.question()
-            assert second["id"] > question["id"]
-            await served.post(f"/questions/{second['id']}/answer", {"answer": "done"})
-            found = await served.until(key, "finished")
-            assert served.laboratories[0].bench.answers == ["done", "done"]
-            assert [entry["what"] for entry in found["audit"]].count("answer") == 2
-
-    run(work())
+async def test_a_step_at_the_bench_is_asked_and_the_first_answer_counts(with_person: Path) -> None:
+    async with serving(with_person, asking(REFILL)) as served:
+        key = await served.submit()
+        question = await served.question()
+        assert {name: question[name] for name in ("campaign", "kind", "text", "wants", "hands", "details")} == {
+            "campaign": key,
+            "kind": "bench",
+            "text": REFILL.text,
+            "wants": "done",
+            "hands": True,
+            "details": {"load": 100.0},
+        }
+        where = f"/questions/{question['id']}/answer"
+        wrong = await served.post(where, {"answer": "yes"}, status=422)
+        assert wrong["detail"] == "'yes' is not an answer; answer with 'done' when it is done, or 'give up'"
+        await served.post(where, {"answer": "done"}, role=Role.VIEWER, status=403)
+        told = await served.post(where, {"answer": " Done "})
+        assert (told["answer"], told["by"], told["open"]) == ("done", "operator", False)
+        late = await served.post(where, {"answer": "done"}, status=404)
+        assert late["detail"] == f"question {question['id']} is not open"
+        second = await served.question()
+        assert second["id"] > question["id"]
+        await served.post(f"/questions/{second['id']}/answer", {"answer": "done"})
+        found = await served.until(key, "finished")
+        assert served.laboratories[0].bench.answers == ["done", "done"]
+        assert [entry["what"] for entry in found["audit"]].count("answer") == 2
 
 
-def test_a_weight_is_typed_with_its_unit(with_person: Path) -> None:
-    async def work() -> None:
-        async with serving(with_person, asking(WEIGH)) as served:
-            await served.submit()
-            question = await served.question()
-            assert question["problem"] == "the balance is silent"
-            where = f"/questions/{question['id']}/answer"
-            assert "unit" in (await served.post(where, {"answer": "203.4"}, status=422))["detail"]
-            assert (await served.post(where, {"answer": "203.4 g"}))["answer"] == "203.4 g"
-            served.laboratories[0].bench.question = None
-
-    run(work())
+async def test_a_weight_is_typed_with_its_unit(with_person: Path) -> None:
+    async with serving(with_person, asking(WEIGH)) as served:
+        await served.submit()
+        question = await served.question()
+        assert question["problem"] == "the balance is silent"
+        where = f"/questions/{question['id']}/answer"
+        assert "unit" in (await served.post(where, {"answer": "203.4"}, status=422))["detail"]
+        assert (await served.post(where, {"answer": "203.4 g"}))["answer"] == "203.4 g"
+        served.laboratories[0].bench.question = None
 
 
-def test_a_decision_is_answered_with_one_of_its_options(with_person: Path) -> None:
+async def test_a_decision_is_answered_with_one_of_its_options(with_person: Path) -> None:
     missed = OperatorQuestion("It missed.", "option", about="decision", hands=False, options=("accept", "repeat"))
-
-    async def work() -> None:
-        async with serving(with_person, asking(missed)) as served:
-            await served.submit()
-            question = await served.question()
-            assert (question["wants"], question["options"]) == ("option", ["accept", "repeat"])
-            where = f"/questions/{question['id']}/answer"
-            wrong = await served.post(where, {"answer": "yes"}, status=422)
-            assert wrong["detail"] == "'yes' is not an answer; answer with one of: accept; repeat"
-            assert (await served.post(where, {"answer": "Repeat"}))["answer"] == "repeat"
-            served.laboratories[0].bench.question = None
-
-    run(work())
+    async with serving(with_person, asking(missed)) as served:
+        await served.submit()
+        question = await served.question()
+        assert (question["wants"], question["options"]) == ("option", ["accept", "repeat"])
+        where = f"/questions/{question['id']}/answer"
+        wrong = await served.post(where, {"answer": "yes"}, status=422)
+        assert wrong["detail"] == "'yes' is not an answer; answer with one of: accept; repeat"
+        assert (await served.post(where, {"answer": "Repeat"}))["answer"] == "repeat"
+        served.laboratories[0].bench.question = None
 
 
-def test_a_question_that_nobody_needs_any_more_is_closed(with_person: Path) -> None:
-    async def work() -> None:
-        async with serving(with_person, asking(REFILL)) as served:
-            key = await served.submit()
-            question = await served.question()
-            await served.post(f"/campaigns/{key}/abort")
-            await served.until(key, "unknown", "paused")
-            assert await served.get("/questions") == []
-            (found,) = await served.get("/questions", answered=True)
-            assert (found["id"], found["closed"], found["answer"]) == (question["id"], "withdrawn", None)
-
-    run(work())
+async def test_a_question_that_nobody_needs_any_more_is_closed(with_person: Path) -> None:
+    async with serving(with_person, asking(REFILL)) as served:
+        key = await served.submit()
+        question = await served.question()
+        await served.post(f"/campaigns/{key}/abort")
+        await served.until(key, "unknown", "paused")
+        assert await served.get("/questions") == []
+        (found,) = await served.get("/questions", answered=True)
+        assert (found["id"], found["closed"], found["answer"]) == (question["id"], "withdrawn", None)
 
 
 def test_a_question_whose_facts_are_still_read_is_announced(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -67,16 +67,12 @@ def test_an_idle_arm_that_cannot_move_says_why_and_what_to_do(
 
 
 @pytest.mark.realtime
-def test_a_controller_that_refuses_connections_is_a_status_too(tmp_path: Path) -> None:
+async def test_a_controller_that_refuses_connections_is_a_status_too(tmp_path: Path) -> None:
     rig = hardware_rig(tmp_path, "127.81.4.2")  # loopback: every port refuses
-
-    async def work() -> None:
-        async with serving(tmp_path, rigs=(rig,), arm_interval=0.05) as served:
-            arm = await arm_of(served, "rig", "fail")
-            assert "all ports that Decant uses are closed" in arm["text"]
-            assert "while booting, wait" in arm["advice"]
-
-    run(work())
+    async with serving(tmp_path, rigs=(rig,), arm_interval=0.05) as served:
+        arm = await arm_of(served, "rig", "fail")
+        assert "all ports that Decant uses are closed" in arm["text"]
+        assert "while booting, wait" in arm["advice"]
 
 
 SHORT = 20.0
@@ -96,7 +92,7 @@ class ArmThatIsRead:
         return DeviceCheck("motion", "ok", "the arm is ready to move")
 
 
-def test_an_arm_is_not_read_during_a_run_and_no_run_begins_during_a_reading(
+async def test_an_arm_is_not_read_during_a_run_and_no_run_begins_during_a_reading(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     laboratory = tmp_path / "numbers.yaml"
@@ -104,37 +100,29 @@ def test_an_arm_is_not_read_during_a_run_and_no_run_begins_during_a_reading(
     arm = ArmThatIsRead()
     monkeypatch.setattr(rig_worker, "arm_kind", lambda spec: spec)
     spec = load_laboratory(laboratory).model_copy(update={"mode": "hardware", "arm": arm})
-
-    async def work() -> None:
-        async with serving(tmp_path, held, rigs=(Rig("north", laboratory, spec),), arm_interval=0.0) as served:
-            async with asyncio.timeout(PATIENCE):
-                while not arm.readings:
-                    await asyncio.sleep(0.01)
-            key = await served.submit(rig="north")
-            assert (await served.get(f"/campaigns/{key}"))["state"] == "queued"
-            arm.go.set()
-            bench = (await served.pouring()).bench
-            counted = len(arm.readings)
-            for _ in range(100):
-                await asyncio.sleep(0)
-            rigs = await served.get("/rigs")
-            assert [one["arm"] for one in rigs if one["name"] == "north"] == [None]
-            assert len(arm.readings) == counted
-            bench.go.set()
-            await served.until(key, "finished")
-            assert await arm_of(served, "north", "ok")
-            assert len(arm.readings) > counted
-
-    run(work())
+    async with serving(tmp_path, held, rigs=(Rig("north", laboratory, spec),), arm_interval=0.0) as served:
+        async with asyncio.timeout(PATIENCE):
+            while not arm.readings:
+                await asyncio.sleep(0.01)
+        key = await served.submit(rig="north")
+        assert (await served.get(f"/campaigns/{key}"))["state"] == "queued"
+        arm.go.set()
+        bench = (await served.pouring()).bench
+        counted = len(arm.readings)
+        for _ in range(100):
+            await asyncio.sleep(0)
+        rigs = await served.get("/rigs")
+        assert [one["arm"] for one in rigs if one["name"] == "north"] == [None]
+        assert len(arm.readings) == counted
+        bench.go.set()
+        await served.until(key, "finished")
+        assert await arm_of(served, "north", "ok")
+        assert len(arm.readings) > counted
 
 
-def test_a_rig_without_hardware_has_no_arm_status(tmp_path: Path) -> None:
+async def test_a_rig_without_hardware_has_no_arm_status(tmp_path: Path) -> None:
     path = Path("configs/laboratories/virtual.yaml").resolve()
-
-    async def work() -> None:
-        async with serving(tmp_path, rigs=(Rig("rig", path, load_laboratory(path)),), arm_interval=0.0) as served:
-            for _ in range(20):
-                await asyncio.sleep(0)
-            assert {one["name"]: one["arm"] for one in await served.get("/rigs")} == {"rig": None, "none": None}
-
-    run(work())
+    async with serving(tmp_path, rigs=(Rig("rig", path, load_laboratory(path)),), arm_interval=0.0) as served:
+        for _ in range(20):
+            await asyncio.sleep(0)
+        assert {one["name"]: one["arm"] for one in await served.get("/rigs")} == {"rig": None, "none": None}

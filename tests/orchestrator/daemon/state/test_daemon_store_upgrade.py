@@ -10,7 +10,7 @@ import pytest
 
 from orchestrator.daemon.state.access_tokens import Role
 from orchestrator.daemon.state.daemon_store import FORMAT, Store, StoreFormatError
-from tests.support.toy_daemon import run, serving
+from tests.support.toy_daemon import serving
 
 WRITTEN = Path(__file__).parents[3] / "data" / "daemon" / "state-0.2.1"
 TOKENS = "".join(f"{role.name.lower()} {role.name.lower()} {role.name.lower() * 6}\n" for role in Role)
@@ -33,23 +33,19 @@ def state_of_0_2_1(folder: Path) -> Path:
     return state
 
 
-def test_the_queue_of_version_0_2_1_goes_on(tmp_path: Path) -> None:
+async def test_the_queue_of_version_0_2_1_goes_on(tmp_path: Path) -> None:
     state = state_of_0_2_1(tmp_path)
-
-    async def work() -> None:
-        async with serving(tmp_path) as served:
-            assert served.tokens[Role.OPERATOR] == "operator" * 6
-            first, second = await served.get("/campaigns/first"), await served.get("/campaigns/second")
-            assert (first["state"], second["state"]) == ("finished", "queued")
-            assert len(first["pours_made"]) == 3
-            assert first["after"] is None
-            assert [entry["what"] for entry in second["audit"]] == ["submit"]
-            assert (await served.get("/materials"))["liquids"][0]["id"] == "water"
-            await served.post("/queue/resume")
-            ended = await served.until(second["id"], "finished")
-            assert ended["verdict"]["word"] == ended["summary"]["verdict"]["word"]
-
-    run(work())
+    async with serving(tmp_path) as served:
+        assert served.tokens[Role.OPERATOR] == "operator" * 6
+        first, second = await served.get("/campaigns/first"), await served.get("/campaigns/second")
+        assert (first["state"], second["state"]) == ("finished", "queued")
+        assert len(first["pours_made"]) == 3
+        assert first["after"] is None
+        assert [entry["what"] for entry in second["audit"]] == ["submit"]
+        assert (await served.get("/materials"))["liquids"][0]["id"] == "water"
+        await served.post("/queue/resume")
+        ended = await served.until(second["id"], "finished")
+        assert ended["verdict"]["word"] == ended["summary"]["verdict"]["word"]
     database = sqlite3.connect(state / "daemon.sqlite")
     assert database.execute("pragma user_version").fetchone() == (FORMAT,)
     database.close()

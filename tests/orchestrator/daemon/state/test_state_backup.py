@@ -12,43 +12,39 @@ import pytest
 
 from orchestrator.daemon.state.state_backup import BackupError, back_up, restore
 from tests.support.station import content, order, rigs_in, set_up, until_pour
-from tests.support.toy_daemon import held, run, serving
+from tests.support.toy_daemon import held, serving
 
 
 @pytest.mark.slow
-def test_a_restored_daemon_has_results_and_account_and_waits_for_an_operator(tmp_path: Path) -> None:
+async def test_a_restored_daemon_has_results_and_account_and_waits_for_an_operator(tmp_path: Path) -> None:
     here, there, archive = tmp_path / "here", tmp_path / "there", tmp_path / "backup.zip"
     here.mkdir()
     there.mkdir()
-
-    async def work() -> None:
-        async with serving(here, held, rigs=rigs_in(here)) as served:
-            await set_up(served)
-            await served.post("/pours", order("done", amount="30 g"))
-            (await served.pouring()).bench.go.set()
-            done = await until_pour(served, "done", "weighed")
-            await served.post("/materials/vessels/beaker/weighed", {"mass": "100 g"})
-            before = await content(served, "vial-1")
-            await served.post("/pours", order("begun", receiver="vial-2"))
-            while len(served.laboratories) < 2:
-                await asyncio.sleep(0.01)
-            await served.laboratories[-1].bench.begun.wait()
-            await served.post("/pours", order("queued", amount="5 g"))
-            found = await asyncio.to_thread(back_up, here / "state", archive)
-            assert found["runs"] == 2
-            await served.post("/queue/pause")
-            served.laboratories[-1].bench.go.set()
-            await until_pour(served, "begun", "weighed")
-        restore(archive, there / "state")
-        async with serving(there, rigs=rigs_in(there)) as served:
-            assert (await served.get("/status"))["queue_paused"]
-            assert (await served.get("/pours/done"))["result"] == done["result"]
-            assert await content(served, "vial-1") == before
-            assert (await served.get("/pours/begun"))["state"] == "unknown"  # the backup can't know its outcome
-            assert (await served.get("/pours/queued"))["state"] == "queued"
-            assert not served.laboratories
-
-    run(work())
+    async with serving(here, held, rigs=rigs_in(here)) as served:
+        await set_up(served)
+        await served.post("/pours", order("done", amount="30 g"))
+        (await served.pouring()).bench.go.set()
+        done = await until_pour(served, "done", "weighed")
+        await served.post("/materials/vessels/beaker/weighed", {"mass": "100 g"})
+        before = await content(served, "vial-1")
+        await served.post("/pours", order("begun", receiver="vial-2"))
+        while len(served.laboratories) < 2:
+            await asyncio.sleep(0.01)
+        await served.laboratories[-1].bench.begun.wait()
+        await served.post("/pours", order("queued", amount="5 g"))
+        found = await asyncio.to_thread(back_up, here / "state", archive)
+        assert found["runs"] == 2
+        await served.post("/queue/pause")
+        served.laboratories[-1].bench.go.set()
+        await until_pour(served, "begun", "weighed")
+    restore(archive, there / "state")
+    async with serving(there, rigs=rigs_in(there)) as served:
+        assert (await served.get("/status"))["queue_paused"]
+        assert (await served.get("/pours/done"))["result"] == done["result"]
+        assert await content(served, "vial-1") == before
+        assert (await served.get("/pours/begun"))["state"] == "unknown"  # the backup can't know its outcome
+        assert (await served.get("/pours/queued"))["state"] == "queued"
+        assert not served.laboratories
 
 
 def test_a_backup_is_refused_where_it_would_overwrite_or_is_none(tmp_path: Path) -> None:
