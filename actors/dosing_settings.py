@@ -46,7 +46,7 @@ class DosingSettings(Settings):
     largest_fine_flow: ClassVar[float] = 0.008
     """Upper bound of the flow at the end of a dose."""
 
-    smallest_top_up: ClassVar[float] = 1.5e-3
+    smallest_top_up: ClassVar[float] = 1.0e-3
     """Smallest shortage that is poured again; smaller ones cannot be met dependably."""
 
     most_top_ups: ClassVar[int] = 3

@@ -630,7 +630,8 @@ class DoseController:
         likely = min(max(float(self._estimator.mass.mean()), amount - self._step_size), amount + self._step_size)
         if self._suspected is not None and self._late_mass - amount > max(2.5e-3, 0.3 * self._late_mass):
             self._end = self._end or self._suspected
-        if self._end is None and self._order.amount - likely > self._settings.smallest_top_up:
+        smallest = max(self._settings.smallest_top_up, 1.5 * self._step_size)
+        if self._end is None and self._order.amount - likely > smallest:
             paused = self._pauses if self._paused else self._top_ups
             if paused < (MOST_PAUSES if self._paused else self._settings.most_top_ups):
                 self._pauses += self._paused
@@ -785,7 +786,7 @@ class DoseController:
         deviation = math.hypot(float(predicted.std()), e.deviation())
         gate = max(5.0 * deviation, 1.5e-3 + 0.1 * self.flow)
         expected = float(predicted.mean())
-        if net.mass - expected > UNEXPECTED * deviation and self._begins_to_rise():
+        if net.mass - expected > UNEXPECTED * deviation and tilt >= self._tilt and self._begins_to_rise():
             e.flows_unexpectedly(net, self._rate(RISES))
             expected = net.mass
         if abs(net.mass - expected) > gate:
@@ -811,7 +812,10 @@ class DoseController:
         return (self._late_mass if self._top_ups else 0.0) + max(SEEN, 2.5 * self._step_size)
 
     def _begins_to_rise(self) -> bool:
-        """Whether the last readings rise, faster than the particles flow and as slowly as a stream can."""
+        """Whether the last readings rise, faster than the particles flow and as slowly as a stream can.
+
+        While the arm turns back, they rise because they are late.
+        """
         last = [reading.mass for reading in self._recent[-RISES:]]
         rises = all(after > before + 0.5 * self._step_size for before, after in itertools.pairwise(last))
         if self.phase not in (DosePhase.APPROACH, DosePhase.POUR) or len(last) < RISES or not rises:

@@ -60,6 +60,9 @@ vessel is known to the tolerance of `SimulationParameters.tilt_zero`."""
 FLOW_FACTOR = (1.0, 0.2)
 """Flow factor before the first dose: median, and standard deviation of its logarithm."""
 
+LARGEST_CHANGE = 2.4
+"""Change of the flow factor in one dose above which its belief is doubted: four deviations before the first one."""
+
 FIRST_AIM = 0.3e-3
 """`DoseBelief.aim` of the first dose, if its last stream leaves the lip cleanly [kg]."""
 
@@ -606,6 +609,9 @@ class DoseEstimator:
     def belief(self, *, weighed: float | None, aim: float) -> DoseBelief:
         """The belief after this dose.
 
+        No cup's flow changes by `LARGEST_CHANGE` from one dose to the next: then half of the particles are as they were
+        before this one, which may have misled the others.
+
         Args:
             weighed: amount in the receiver after the dose [kg]; None if it is unknown.
             aim: see `DoseBelief.aim`.
@@ -613,9 +619,12 @@ class DoseEstimator:
         volume = self.volume
         if weighed is not None:  # the content of the receiver has left the source
             volume = np.maximum(self._belief.volume - weighed / self.cup.density, 0.0)
+        onset_bias, flow_factor = self.onset_bias.copy(), self.flow_factor.copy()
+        if abs(float(np.log(flow_factor).mean() - np.log(self._belief.flow_factor).mean())) > math.log(LARGEST_CHANGE):
+            onset_bias[::2], flow_factor[::2] = self._belief.onset_bias[::2], self._belief.flow_factor[::2]
         display = replace(self._belief.display, repeats=self.repeats.beta(), noise=self.noise)
         return DoseBelief(
-            self.onset_bias, self.flow_factor, self.lag, self.lag_shape, volume, aim, self._belief.doses + 1, display
+            onset_bias, flow_factor, self.lag, self.lag_shape, volume, aim, self._belief.doses + 1, display
         )
 
 

@@ -299,3 +299,13 @@ def test_doses_with_gaps_stay_within_their_tolerance(of: str, seed: int) -> None
     for dose in dosing_gaps.pour_series(of, seed):
         assert dose.error < 1.0
         assert dose.end in (DoseEnd.REACHED, DoseEnd.MISSED)
+
+
+def test_a_pause_of_the_commands_does_not_mislead_the_next_dose() -> None:
+    """Readings that were late while the arm turned back by itself were taken for a stream: 13 g too much in the next
+    dose."""
+    from dosing_gaps import pour_series
+
+    first, second = pour_series("commands", 71332)
+    assert abs(first.error) < 2.0
+    assert abs(second.error) < 2.0
