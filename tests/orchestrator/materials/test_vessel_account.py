@@ -304,6 +304,18 @@ def test_a_cup_of_a_mixture_has_what_was_weighed_into_it_and_is_unknown_during_a
     assert composition(account, cup) == {}
 
 
+def test_a_liquid_that_a_person_has_entered_in_a_cup_is_in_it_for_the_bench_too(tmp_path: Path) -> None:
+    """Otherwise it was dosed again into that cup."""
+    account = VesselAccount(tmp_path / "account.sqlite")
+    places = LaboratoryPlaces(account, "bench")
+    account.fill("bench/rack/A1", 0.012, 1e-4, liquid="water", by="ada")
+    assert places.composition("rack/A1") == {"water": (0.012, 1e-4)}
+    account.weigh("bench/rack/A1", 0.0, 0.0, by="ada")
+    assert places.composition("rack/A1") == {}
+    places.content("source/water", 0.3, 1e-3, "water")
+    assert places.composition("source/water") == {}
+
+
 def test_a_cup_with_a_dose_of_unknown_amount_is_unknown(tmp_path: Path) -> None:
     account, series = VesselAccount(tmp_path / "account.sqlite"), mixtures.plan({"water": 40.0, "oil": 10.0})
     subscriber, (pour, _) = account.follow(series), mixtures.asked(Mix(series, 5))
