@@ -310,6 +310,7 @@ class _OpenLaboratory:
     async def restart_bench(self) -> None:
         """See `Restartable.restart_bench`."""
         opened, self._opened = self._opened, None
+        self._spec = self._spec.resumed()
         if opened is not None:
             self._devices = [device for device in self._devices if device not in opened.devices]
             with contextlib.suppress(LaboratoryError):

@@ -8,6 +8,7 @@ never reads it.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, create_model, field_validator
@@ -233,6 +234,10 @@ class LaboratorySettings(Settings):
     def expected_arm(self) -> ArmSettings | None:
         """The arm with the geometry that a run will use: for checks before it is connected."""
         return None if self.arm is None else self.arm.expected(virtual=self.mode == "virtual")
+
+    def resumed(self) -> Self:
+        """The laboratory in the middle of a campaign: the sources hold what was left in them."""
+        return self.with_values(vessels=tuple(replace(vessel, filled=False) for vessel in self.vessels))
 
     def in_real_time(self) -> Self:
         """The laboratory for wanted amounts: an arm over its wires that carries nothing then moves in real time.

@@ -325,8 +325,8 @@ class DoseHandling:
             await (
                 self._exchange(cup, consent) if emptying is None else self._empty_at_waste(cup, emptying, consent, seed)
             )
-        if scene.liquid.name in (composition := self._record.composition(cup)):
-            mass = composition[scene.liquid.name][0]
+        mass = self._record.composition(cup).get(scene.liquid.name, (0.0, 0.0))[0]
+        if mass != 0.0:
             held = "an UNKNOWN mass" if mass is None else f"{1e3 * mass:.1f} g"
             raise InvalidActionError(
                 f"'{cup}' has {held} of {scene.liquid.name} already, and no liquid is dosed into a cup twice"
@@ -545,7 +545,7 @@ class DoseHandling:
         await consent.given(move_question(f"take {label(source)}"))
 
     def _mixture(self, cup: str) -> str:
-        liquids = [name for name in self._record.composition(cup) if name]
+        liquids = [name for name, (mass, _) in self._record.composition(cup).items() if name and mass != 0.0]
         return liquids[0] if len(liquids) == 1 else "mixture" if liquids else ""
 
     # ---- the dose
@@ -558,6 +558,15 @@ class DoseHandling:
         of, half = source_of(scene, dose), 0.5 * dose.amount  # until it is weighed, none or all of it may be gone
         left = max(of.mass - half, 0.0), math.hypot(of.deviation, half)
         self._liquids.enter(source, *left, scene.liquid.name)
+
+    def withdraw(self, scene: Scene, dose: DoseTarget) -> None:
+        """The source was not tilted: the contents are again what they were before `begins`."""
+        source, cup = self.names(scene, dose)
+        assert self._tare is not None
+        self._record.add_component(cup, scene.liquid.name, 0.0, 0.0, source)
+        self._liquids.enter(cup, *self._tare.content, self._mixture(cup))
+        of = source_of(scene, dose)
+        self._liquids.enter(source, of.mass, of.deviation, scene.liquid.name)
 
     async def finish(
         self, consent: MotionConsent, scene: Scene, dose: DoseTarget, amount: tuple[float, float]

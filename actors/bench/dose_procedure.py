@@ -115,6 +115,7 @@ class DoseProcedure(BenchProcedure):
         self._series: DoseSeries | None = None
         self._placed: tuple[DoseReading, ...] = ()
         self._zero = self._at = self._duration = 0.0
+        self._entered = False  # in the account, as a dose that has begun
 
     # ---- steps in order
 
@@ -264,6 +265,7 @@ class DoseProcedure(BenchProcedure):
         await setup.ground_truth.flows()
         if setup.doses is not None:
             setup.doses.begins(self._scene, self._dose)
+            self._entered = True
         self._begun = True
         self._report.enter("dose")
         try:
@@ -351,6 +353,10 @@ class DoseProcedure(BenchProcedure):
             weight = await self._setup.balance.weigh()
             return f"the balance shows {grams(weight.mass - self._zero)} in the receiver"
         return "the amount in the receiver is UNKNOWN"
+
+    def _withdraw(self) -> None:
+        if self._entered and self._setup.doses is not None:
+            self._setup.doses.withdraw(self._scene, self._dose)
 
     async def _unknown(self, error: LaboratoryError) -> str:
         return f"It was not the dose that was asked for: {await self._remaining()}"

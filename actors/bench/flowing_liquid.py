@@ -59,7 +59,7 @@ class FlowOrder:
 
 @dataclass(frozen=True)
 class FlowEnd:
-    """What flowed: masses in the receiver, next to it, and left in the cup [kg]; largest and last tilt [rad].
+    """What flowed: masses in the receiver, next to it, and left in the cup [kg].
 
     Attributes:
         upright: time for which the cup has been upright at the end [s of controller time]; 0 if it is not.
@@ -69,7 +69,6 @@ class FlowEnd:
     received: float
     spilled: float
     left: float
-    tilt: float
     upright: float
     times: tuple[float, ...]
     tilts: tuple[float, ...]
@@ -147,7 +146,6 @@ class FlowingLiquid:
             received,
             self._pour.spilled,
             self._bench.content,
-            self._tilt,
             upright,
             *(tuple(map(float, column)) for column in columns.T),
         )

@@ -268,7 +268,7 @@ class GroundTruth:
         yield
 
     async def untouched(self) -> bool:
-        """Whether it is certain that the pourer was not tilted in this pour; only an emulated arm can tell."""
+        """Whether it is certain that nothing has left the pourer; only an emulated arm can tell."""
         return False
 
     async def flows(self) -> None:

@@ -263,10 +263,10 @@ class BenchProcedure(ABC):
         except LaboratoryError as error:
             self._begun = self._begun or (self._moves and setup.lost)
             text = f"{error}. {await self._unknown(error) if self._begun else 'Nothing was poured'}"
-            # a dose with carrying has marked its cup as UNKNOWN, and only a person may enter its content
-            untouched = not self._begun or (setup.doses is None and await setup.ground_truth.untouched())
+            untouched = not self._begun or await setup.ground_truth.untouched()
             await self._consent.leave_safe()
             if setup.mode == "virtual" and untouched and _is_lost_link(error):
+                self._withdraw()
                 raise LinkLostError(text) from error
             raise (UnknownPourError if self._begun else NotPouredError)(text) from error
         finally:
@@ -279,6 +279,10 @@ class BenchProcedure(ABC):
     @abstractmethod
     async def _remaining(self) -> str:
         """What is known of the liquid, as text."""
+
+    @abstractmethod
+    def _withdraw(self) -> None:
+        """Nothing was poured: remove what the account says since the tilt was about to begin."""
 
     @abstractmethod
     async def _unknown(self, error: LaboratoryError) -> str:
@@ -469,6 +473,9 @@ class PourProcedure(BenchProcedure):
 
     async def _remaining(self) -> str:
         return f"weighed until then: {self._weighed()}"
+
+    def _withdraw(self) -> None:
+        pass  # a pour is entered once it is weighed
 
     async def _unknown(self, error: LaboratoryError) -> str:
         if not isinstance(error, BalanceError):

@@ -511,7 +511,7 @@ class FollowedBench(VirtualBench):
 
     async def prepare_dose(self, scene: Scene, dose: DoseTarget, seed: int, carried: tuple[str, str] | None) -> None:
         """See `GroundTruth.prepare_dose`."""
-        source, contents = source_of(scene, dose), self.contents
+        source, contents, self._pour = source_of(scene, dose), self.contents, None
         contents.pourer, contents.receiver = carried or (source.vessel or "pourer", dose.cup or "receiver")
         if carried is None and dose.cup:
             known = contents.liquids.get(dose.cup, dose.held or 0.0)
@@ -549,9 +549,11 @@ class FollowedBench(VirtualBench):
                     await device.pace(self._time_scale)
 
     async def untouched(self) -> bool:
-        """See `GroundTruth.untouched`."""
+        """See `GroundTruth.untouched`; of a dose, that nothing has left the pourer."""
         with contextlib.suppress(LaboratoryError):
             await self.flowed()
+            if self._left is None and self._pour is None:  # a dose that did not come to its tilt
+                return True
             if self._left is None:
                 await self.note()
                 self._left = self._motion(None, 0.0) is not None
@@ -573,7 +575,7 @@ class FollowedBench(VirtualBench):
         self._flowing = False
         self._left = True  # unless the emulators report otherwise
         end = await self.emulators.flowed()
-        self._left = end.tilt > UPRIGHT or end.received + end.spilled > 0.0
+        self._left = end.received + end.spilled > 0.0
         self.contents.receive(end.spilled, end.left)
         return {"true": end.received, "upright": end.upright}
 

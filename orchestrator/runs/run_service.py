@@ -219,8 +219,8 @@ class RunService:
         from actors.laboratory import open_laboratory
 
         spec = resources.settings(request.campaign)
-        if request.resume:  # the sources hold what the run has left in them
-            spec = spec.with_values(vessels=tuple(replace(vessel, filled=False) for vessel in spec.vessels))
+        if request.resume:
+            spec = spec.resumed()
         if resources.laboratory is not None:
             laboratory = resources.laboratory(spec, request.pours)
         else:

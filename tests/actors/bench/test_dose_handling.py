@@ -22,6 +22,7 @@ from actors.interfaces import (
     DoseSource,
     DoseTarget,
     InvalidActionError,
+    LinkLostError,
     NotPouredError,
     UnknownPourError,
 )
@@ -232,6 +233,47 @@ def test_a_cup_lost_on_its_way_is_unknown_and_an_interrupted_dose_leaves_an_unkn
     again = [question for question in stage.operator.heard if question.about == "vessels_laid_out"]
     assert len(again) == 2
     assert again[1].problem == "it is unknown where 'rack/A1' stands"
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+@pytest.mark.parametrize("moment", ["approach", "tilt"])
+def test_a_dose_is_made_by_a_restarted_bench_after_the_link_was_lost_before_the_tilt(
+    open_stage: OpenStage, tmp_path: Path, moment: str
+) -> None:
+    """Nothing flowed: the cup is not UNKNOWN, and nothing is laid out anew but what the arm held."""
+
+    async def play(stage: Stage, record: Watched) -> None:
+        await dosed(stage, 20, "water", "rack/A1")
+        left = record.held("source/water")
+        assert left is not None
+        truth = stage.bench.ground_truth
+        step, name = (truth.flows, "flows") if moment == "tilt" else (truth.prepare_dose, "prepare_dose")
+
+        async def struck(*arguments: Any) -> None:
+            await step(*arguments)
+            await stage.site.fault("drop")
+
+        if moment == "tilt":
+            setattr(truth, name, struck)
+        else:
+            record.once["source/water: the arm began to take it from 'source/water'"] = lambda: stage.site.fault("drop")
+        with pytest.raises(LinkLostError):
+            await dosed(stage, 10, "water", "rack/A2", held=left[0], fill=False)
+        assert not record.unknown("rack/A2")
+        again = record.held("source/water")
+        assert again is not None
+        assert again[0] == pytest.approx(left[0], abs=1e-4)
+        record.stage = None
+        await stage.laboratory.restart_bench()
+        stage.attend()
+        measured = await dosed(stage, 10, "water", "rack/A2", held=left[0], fill=False)
+        assert measured.notes["dose"]["received"] == pytest.approx(0.01, abs=2e-3)
+        held = record.held("rack/A1")
+        assert held is not None
+        assert held[0] == pytest.approx(0.02, abs=2e-3)
+
+    played(open_stage, tmp_path, play)
 
 
 @pytest.mark.slow
