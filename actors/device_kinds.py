@@ -176,8 +176,8 @@ class UrArmKind(ArmKind[UrArmSettings]):
         path = folder / spec.calibration_file
         try:
             recorded = json.loads(path.read_text(encoding="utf-8"))["readout"]
-            found = findings_of(recorded)
-            state, model = found.state, found.model
+            findings = findings_of(recorded)
+            state, model = findings.state, findings.model
         except OSError as error:
             raise ValueError(f"calibration_file {path}: {error.strerror}") from None
         except (ValueError, KeyError, TypeError):

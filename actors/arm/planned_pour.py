@@ -208,8 +208,8 @@ def pack(executed: ExecutedPath) -> dict[str, Any]:
 def _forces(forces: FloatArray) -> dict[str, Any]:
     """Forces in hundredths, each kind only if it was reported."""
     kinds = {"external_force": forces[:, 1:7], "wrist_force": forces[:, 7:]}
-    known = {name: np.round(rows, 2).tolist() for name, rows in kinds.items() if np.isfinite(rows).any()}
-    return {"forces": {"times": np.round(forces[:, 0], 2).tolist(), **known}} if known else {}
+    series = {name: np.round(rows, 2).tolist() for name, rows in kinds.items() if np.isfinite(rows).any()}
+    return {"forces": {"times": np.round(forces[:, 0], 2).tolist(), **series}} if series else {}
 
 
 def unpack(data: dict[str, Any]) -> ExecutedPath:

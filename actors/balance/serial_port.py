@@ -292,8 +292,8 @@ def _reason(port: str, error: OSError) -> str:
     """Return why a port cannot be opened, and a remedy."""
     number = error.errno
     if number == 2 or not Path(port).exists():
-        known = ports()
-        listed = f"there are {', '.join(known)}" if known else "no serial port of a balance is there"
+        present = ports()
+        listed = f"there are {', '.join(present)}" if present else "no serial port of a balance is there"
         return f"there is no such port; {listed}. Is the cable plugged in and the balance switched on?"
     if number == 13:
         return "this user may not open it; add the user to the group that owns it (often 'dialout') and log in anew"
@@ -337,8 +337,8 @@ def look_at_port(name: str) -> DeviceCheck:
         return DeviceCheck("balance port", "ok", f"{name}, over TCP")
     port = Path(name)
     if not port.exists():
-        known = ports()
-        listed = f"there are {', '.join(known)}" if known else "no serial port is there"
+        present = ports()
+        listed = f"there are {', '.join(present)}" if present else "no serial port is there"
         return DeviceCheck("balance port", "fail", f"{port} isn't there", f"plug the cable in, switch it on; {listed}")
     if (other := _other_than_a_port(port)) is not None:
         return DeviceCheck("balance port", "fail", f"{port} is {other}", "name the serial port that the balance is on")

@@ -378,10 +378,12 @@ class PourProcedure(BenchProcedure):
         await self._ready()
         show = self._report.pour if self._report.watched else None
         await setup.ground_truth.prepare(PourAsk(self._scene, self._action, self._path, self._seed, show))
-        known: dict[str, PourMasses] = {}
+        source_masses: dict[str, PourMasses] = {}
         if setup.handling is not None:
-            known = await setup.handling.prepare(self._consent, self._weighings.weighed.get("pourer_empty"), self._seed)
-        await self._weighings.before(known)
+            source_masses = await setup.handling.prepare(
+                self._consent, self._weighings.weighed.get("pourer_empty"), self._seed
+            )
+        await self._weighings.before(source_masses)
 
     async def _move(self) -> None:
         """Approach, pour and return home after one consent, unless a stop interrupts the motion."""

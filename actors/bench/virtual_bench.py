@@ -514,8 +514,8 @@ class FollowedBench(VirtualBench):
         source, contents, self._pour = source_of(scene, dose), self.contents, None
         contents.pourer, contents.receiver = carried or (source.vessel or "pourer", dose.cup or "receiver")
         if carried is None and dose.cup:
-            known = contents.liquids.get(dose.cup, dose.held or 0.0)
-            contents.in_receiver = 0.0 if dose.held is None else known
+            cup_content = contents.liquids.get(dose.cup, dose.held or 0.0)
+            contents.in_receiver = 0.0 if dose.held is None else cup_content
         for name, spec, usual in (
             (contents.pourer, scene.pourer, "pourer"),
             (contents.receiver, scene.receiver, "receiver"),

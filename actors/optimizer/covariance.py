@@ -219,8 +219,8 @@ class Covariance:
     def variance(self, theta: Array, points: Array) -> Array:
         """Variance of the noise-free cost at points (m, d): (m,)."""
         value = self.value(theta, "signal") ** 2
-        known = 0.0 if self._known is None else (self._known.predict(points)[1] / self._unit) ** 2
-        return np.full(len(points), value) + known
+        prior_variance = 0.0 if self._known is None else (self._known.predict(points)[1] / self._unit) ** 2
+        return np.full(len(points), value) + prior_variance
 
 
 def _by_length(points: Array, G: Array) -> Array:

@@ -75,7 +75,7 @@ def looked_ahead(
     process: ModelAveragedProcess,
     pour: Array,
     candidates: Array,
-    known: Array,
+    poured: Array,
     pours_left: int,
     allowed: Callable[[Array, Array], Array],
     feasibility: Feasibility | None,
@@ -86,7 +86,7 @@ def looked_ahead(
         process: of the cost.
         pour: (dimension,), the best by its own loss and savings.
         candidates: (m, dimension), the first of them all over the region.
-        known: (k, dimension), poured actions that may be poured again; k ≥ 0.
+        poured: (k, dimension), actions that were poured and may be again; k ≥ 0.
         pours_left: H.
         allowed: applies limits and refusals to values (p,) of pours at places (p, dimension).
         feasibility: of requests; None if no request was refused.
@@ -107,7 +107,7 @@ def looked_ahead(
     ]
     places = np.concatenate([pour[None, :], candidates[np.unique(np.concatenate(chosen))]])
     others = np.concatenate([costs.argmin(axis=1), np.arange(min(TARGETS, len(candidates)))])
-    targets = np.unique(np.concatenate([places, known, candidates[others]]), axis=0)
+    targets = np.unique(np.concatenate([places, poured, candidates[others]]), axis=0)
     if feasibility is not None and (likely := feasibility.likely(targets)).any():
         targets = targets[likely]
     # E c(x) − H (min_x′ E c(x′) − E_y min_x′ E[c(x′) | y at x]): less H knowledge gradients (Frazier et al. 2009)
@@ -160,18 +160,18 @@ FORBIDDEN = 1e3
 
 
 def least_loss(
-    process: ModelAveragedProcess, discrepancy: ModelDiscrepancy, known: Array, feasibility: Feasibility | None = None
+    process: ModelAveragedProcess, discrepancy: ModelDiscrepancy, poured: Array, feasibility: Feasibility | None = None
 ) -> Score:
     """Return the score of a pour, to be minimised.
 
     Args:
         process: of the cost.
         discrepancy: for H and the limit.
-        known: (k, dimension), poured actions that may be poured again; k ≥ 0.
+        poured: (k, dimension), actions that were poured and may be again; k ≥ 0.
         feasibility: of requests; None if no request was refused. An infeasible pour counts as the worst cost.
     """
-    best = float(process.predict(known)[0].min()) / process.worst if len(known) else 0.0
-    pours_left = min(discrepancy.pours_left, FORESIGHT) if len(known) else 0
+    best = float(process.predict(poured)[0].min()) / process.worst if len(poured) else 0.0
+    pours_left = min(discrepancy.pours_left, FORESIGHT) if len(poured) else 0
     allowed = _allowed(process, discrepancy, feasibility)
 
     # E clip(f, 0, 1) − H E (b − f⁺)⁺ by hypothesis, averaged; (b − f⁺)⁺ = (b − f)⁺ − (0 − f)⁺ for b ≥ 0.
@@ -235,9 +235,9 @@ def _allowed(
     return changed
 
 
-def pour_gains(process: ModelAveragedProcess, points: Array, known: Array) -> Array:
+def pour_gains(process: ModelAveragedProcess, points: Array, poured: Array) -> Array:
     """Gain g (m,) of one more pour at points (m, dimension), given poured ones (k ≥ 1, dimension), in cost units."""
-    place = known[int(np.argmin(process.predict(known)[0]))]
+    place = poured[int(np.argmin(process.predict(poured)[0]))]
     means, deviations, noises = process.components(points)
     at_best, its_deviation, _ = (component[:, 0] for component in process.components(place[None, :]))
     best = shortfall(0.0, -at_best, its_deviation)[:, None]  # E f⁺ of each component
@@ -320,28 +320,28 @@ def proposals(
     if query.count == 0:
         return np.empty((0, query.space.dimension))
     assert query.discrepancy is not None
-    known = pourable(arrays, feasibility)
-    score = least_loss(process, query.discrepancy, known, feasibility)
-    candidates = np.concatenate([candidates, known])
+    poured = pourable(arrays, feasibility)
+    score = least_loss(process, query.discrepancy, poured, feasibility)
+    candidates = np.concatenate([candidates, poured])
     pour = acquisition.minimise(score, candidates, arrays.region, rng)
     pours_left = min(query.discrepancy.pours_left, FORESIGHT)
     allowed = _allowed(process, query.discrepancy, feasibility)
     if query.discrepancy.calibration is not None and not len(process.points):
         pour = robust_first_pour(process, query.discrepancy, score, pour, candidates, arrays.region, feasibility, rng)
-    if query.discrepancy.lookahead and len(known):
-        pour = looked_ahead(process, pour, candidates, known, pours_left, allowed, feasibility)
+    if query.discrepancy.lookahead and len(poured):
+        pour = looked_ahead(process, pour, candidates, poured, pours_left, allowed, feasibility)
     if found_good(arrays.simulated_costs) or found_good(arrays.costs):
         simulations = instructive(process, query.count - 1, candidates, score, pour, arrays.busy, arrays.region)
     else:
-        known = np.concatenate([arrays.simulated, arrays.busy])
-        simulations = acquisition.between(query.count - 1, known, arrays.region, rng, feasibility)
+        avoided = np.concatenate([arrays.simulated, arrays.busy])
+        simulations = acquisition.between(query.count - 1, avoided, arrays.region, rng, feasibility)
     return np.concatenate([pour[None, :], simulations])
 
 
 def pourable(arrays: QueryArrays, feasibility: Feasibility | None) -> Array:
     """Poured places (k, dimension) that may be poured again."""
-    known = arrays.known[arrays.region.allows(arrays.known)]
-    return known if feasibility is None or not len(known) else known[feasibility.likely(known)]
+    allowed = arrays.known[arrays.region.allows(arrays.known)]
+    return allowed if feasibility is None or not len(allowed) else allowed[feasibility.likely(allowed)]
 
 
 def found(
@@ -354,16 +354,16 @@ def found(
 ) -> DiscrepancyFound:
     """Return the conclusions about the simulator, and the gain of one more pour."""
     assert query.discrepancy is not None
-    limit, known = query.discrepancy.limit, pourable(arrays, feasibility)
+    limit, poured = query.discrepancy.limit, pourable(arrays, feasibility)
     candidates = arrays.region.draw(GAIN_AT, rng, even=True)
     if len(points):
         candidates = np.concatenate([candidates, points[:1], _near(points[0], arrays.region, rng)])
-    candidates = np.concatenate([candidates, known])
+    candidates = np.concatenate([candidates, poured])
     over = np.zeros(len(candidates)) if limit is None else process.exceedance(candidates, limit.loss)
     gain = None
-    if len(known):
+    if len(poured):
         allowed = over <= (1.0 if limit is None else limit.probability)
-        gain = float(pour_gains(process, candidates[allowed], known).max()) if allowed.any() else None
+        gain = float(pour_gains(process, candidates[allowed], poured).max()) if allowed.any() else None
     shifts, deviations, factor = process.displaced()
     drifts = process.drifts
     offsets: tuple[BenchOffset, ...] = ()

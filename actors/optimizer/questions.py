@@ -60,8 +60,8 @@ FOUND = 0.25
 
 def found_good(costs: Iterable[float]) -> bool:
     """Whether one of some costs is that of a good action."""
-    known = tuple(costs)
-    return min(known, default=0.0) < FOUND * max(known, default=0.0)
+    observed = tuple(costs)
+    return min(observed, default=0.0) < FOUND * max(observed, default=0.0)
 
 
 @dataclass(frozen=True)

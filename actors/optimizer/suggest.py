@@ -60,17 +60,17 @@ def describe(
 ) -> dict[str, object]:
     """Return the surrogate's results about the proposals, the observations and further points."""
     other_space = isinstance(query, CalibrationQuery)
-    known = arrays.known if len(arrays.known) else arrays.simulated
+    observed_points = arrays.known if len(arrays.known) else arrays.simulated
     if feasibility is not None:
-        known = known[feasibility.likely(known)]
-    if (allowed := arrays.region.allows(known)).any():
-        known = known[allowed]  # prior data may lie outside the current constraints
+        observed_points = observed_points[feasibility.likely(observed_points)]
+    if (allowed := arrays.region.allows(observed_points)).any():
+        observed_points = observed_points[allowed]  # prior data may lie outside the current constraints
     means, deviations = model.surrogate.predict(points) if len(points) else (np.empty(0), np.empty(0))
-    at_known, known_deviations = model.surrogate.predict(known)
+    at_known, known_deviations = model.surrogate.predict(observed_points)
     expected = at_known
     if feasibility is not None and len(arrays.costs):
         # E = P m(x) + (1 − P) · (largest observed cost), P that the pour does not fail
-        probability = feasibility.made(known)
+        probability = feasibility.made(observed_points)
         expected = probability * at_known + (1.0 - probability) * arrays.costs.max()
     best = int(np.argmin(expected))
     description: dict[str, object] = {}
@@ -79,17 +79,17 @@ def describe(
         observed = arrays.costs if len(arrays.costs) else arrays.simulated_costs
         limit = max(float(expected[best]), float(observed.min())) + query.equality.tolerance
         equal = _EqualPoints(limit, query.equality.speed, query.space.names, arrays.region, model, feasibility)
-        best = equal.gentlest(known, expected, query.seed)
-        description["equal_ranges"] = equal.ranges(known[best])
+        best = equal.gentlest(observed_points, expected, query.seed)
+        description["equal_ranges"] = equal.ranges(observed_points[best])
     process = model.process
     description |= {
         "means": tuple(map(float, means)),
         "deviations": tuple(map(float, deviations)),
         "noises": () if other_space else tuple(map(float, model.noise_at(points))),
-        "best_point": tuple(map(float, known[best])),
+        "best_point": tuple(map(float, observed_points[best])),
         "best_mean": float(at_known[best]),
         "best_deviation": float(known_deviations[best]),
-        "best_noise": None if other_space else float(model.noise_at(known[best : best + 1])[0]),
+        "best_noise": None if other_space else float(model.noise_at(observed_points[best : best + 1])[0]),
         "hyperparameters": {
             "signal": process.signal,
             "noise": process.noise,
@@ -109,7 +109,7 @@ def describe(
         description["prediction_deviations"] = tuple(map(float, spreads))
     if query.map_resolution and query.space.dimension >= 2:
         sought = _seeks_minimum(query) and len(points) > 0
-        at = np.array(query.map_at) if query.map_at else points[0] if sought else known[best]
+        at = np.array(query.map_at) if query.map_at else points[0] if sought else observed_points[best]
         across, up = sorted(int(i) for i in np.argsort(model.lengths, kind="stable")[:2])
         description["surrogate"] = mapped(query, arrays.region, model, at, (across, up), query.map_resolution)
     return description
@@ -138,20 +138,20 @@ class _EqualPoints:
     model: Model
     feasibility: Feasibility | None
 
-    def gentlest(self, known: Array, expected: Array, seed: int) -> int:
+    def gentlest(self, observed_points: Array, expected: Array, seed: int) -> int:
         """Index of the gentlest of the observed points (n, dimension) with an expected cost (n,) equal to the smallest.
 
         It is no faster than the middle of the equal part of the region, if possible, and the nearest to this middle.
         """
         equal = np.flatnonzero(expected <= self.limit)
         places = self.region.draw(EQUAL_PLACES, np.random.default_rng(seed), even=True)
-        middle = np.concatenate([known[equal], places[self._equal(places)]]).mean(axis=0)
+        middle = np.concatenate([observed_points[equal], places[self._equal(places)]]).mean(axis=0)
         candidates = equal
         if self.speed:
             speed = self.names.index(self.speed)
-            slow = equal[known[equal, speed] <= middle[speed]]
+            slow = equal[observed_points[equal, speed] <= middle[speed]]
             candidates = slow if len(slow) else equal
-        return int(candidates[np.argmin(((known[candidates] - middle) ** 2).sum(axis=1))])
+        return int(candidates[np.argmin(((observed_points[candidates] - middle) ** 2).sum(axis=1))])
 
     def ranges(self, point: Array) -> tuple[tuple[float, float], ...]:
         """By axis, the ends of the equal interval around a point (dimension,)."""
@@ -278,9 +278,9 @@ def propose(query: SuggestionQuery) -> Suggestion:
 
 
 def _fill_space(query: SpaceFillingQuery) -> Suggestion:
-    known = Data(query.known, (0.0,) * len(query.known))
+    tried = Data(query.known, (0.0,) * len(query.known))
     places = {name: getattr(query, name) for name in ("constraints", "infeasible", "refused", "failed", "pending")}
-    arrays = QueryArrays.of(MinimumQuery(query.space, known, **places))
+    arrays = QueryArrays.of(MinimumQuery(query.space, tried, **places))
     feasibility, rng = arrays.feasibility(), np.random.default_rng(query.seed)
     points = acquisition.spread_out(query.count, arrays.taken, arrays.region, rng, feasibility)
     return Suggestion(tuples(points), feasibilities=_feasibilities(feasibility, points))

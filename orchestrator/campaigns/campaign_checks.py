@@ -65,7 +65,7 @@ def senseless(
     pourer: Vessel,
     receiver: Vessel,
     arm: ArmSettings | None,
-    known: dict[tuple[object, ...], float | None],
+    landings: dict[tuple[object, ...], float | None],
 ) -> list[Senseless]:
     """Settings of a stage's actions that make little sense in one of its scenes.
 
@@ -74,9 +74,9 @@ def senseless(
         scene: one of its scenes.
         pourer, receiver: geometry of the scene's vessels, which hold its load.
         arm: arm of the laboratory, if it has one.
-        known: landings computed before, which do not depend on the receiver. Filled here.
+        landings: landings computed before, which do not depend on the receiver. Filled here.
     """
-    findings = [_misses(plan.actions, scene, pourer, receiver, known)]
+    findings = [_misses(plan.actions, scene, pourer, receiver, landings)]
     if arm is not None and arm.tilt_speed_limit is not None:
         findings += [
             _too_fast(plan.actions, scene, name, arm.tilt_speed_limit)
@@ -86,7 +86,7 @@ def senseless(
 
 
 def _misses(
-    actions: Space, scene: Scene, pourer: Vessel, receiver: Vessel, known: dict[tuple[object, ...], float | None]
+    actions: Space, scene: Scene, pourer: Vessel, receiver: Vessel, landings: dict[tuple[object, ...], float | None]
 ) -> Senseless | None:
     """An x_offset from which the stream misses the receiver."""
     half, hits, beside, below = receiver.opening_radius + BESIDE, [], 0.0, False
@@ -96,9 +96,9 @@ def _misses(
         except ValueError:
             continue  # no such action, which is reported elsewhere
         key = (scene.pourer, scene.liquid, scene.pivot, scene.max_hold_time, action)
-        if key not in known:
-            known[key] = _landing(scene, action, pourer, receiver)
-        landing = known[key]
+        if key not in landings:
+            landings[key] = _landing(scene, action, pourer, receiver)
+        landing = landings[key]
         if landing is not None and math.isnan(landing):
             below = True
         elif landing is not None and abs(action.y_offset) < half:

@@ -342,13 +342,13 @@ def resolve_prior(
     if not prior:
         report.add(place, "is empty; name runs, or write 'prior: catalogue'")
     for i, name in enumerate(prior):
-        known = _named(name, place.at(i), references, opened)
-        if known is None:
+        earlier = _named(name, place.at(i), references, opened)
+        if earlier is None:
             continue
-        reasons = _unfit(known, needs, opened)
+        reasons = _unfit(earlier, needs, opened)
         if reasons:
-            report.add(place.at(i), f"the posterior of {known.posterior} can't be a prior here: {'; '.join(reasons)}")
-        named.append(known)
+            report.add(place.at(i), f"the posterior of {earlier.posterior} can't be a prior here: {'; '.join(reasons)}")
+        named.append(earlier)
     if len(report.problems) > before:
         return None
     return _combined(named, needs, opened)
@@ -365,23 +365,23 @@ def _named(name: str, place: Place, references: References, source: PosteriorSou
         return None
 
 
-def _unfit(known: KnownPosterior, needs: PriorNeeds, source: PosteriorSource) -> list[str]:
+def _unfit(earlier: KnownPosterior, needs: PriorNeeds, source: PosteriorSource) -> list[str]:
     """Reasons why a posterior can't be used at all; empty if it can."""
     reasons = []
     laboratory = needs.laboratory
-    if known.simulator != source.simulator:
-        theirs = f"it is of another simulator (version {known.simulator}, here {source.simulator})"
+    if earlier.simulator != source.simulator:
+        theirs = f"it is of another simulator (version {earlier.simulator}, here {source.simulator})"
         reasons.append(f"{theirs}; calibrate again")
-    if known.mode != laboratory.mode:
-        reasons.append(f"it is of a {known.mode} laboratory, and '{laboratory.name}' is {laboratory.mode}")
-    if known.arm != (arm := arm_of(deciding(laboratory))):
-        reasons.append(f"it is of another arm ({known.arm}, here {arm})")
-    for name, value in known.fixed.items():
+    if earlier.mode != laboratory.mode:
+        reasons.append(f"it is of a {earlier.mode} laboratory, and '{laboratory.name}' is {laboratory.mode}")
+    if earlier.arm != (arm := arm_of(deciding(laboratory))):
+        reasons.append(f"it is of another arm ({earlier.arm}, here {arm})")
+    for name, value in earlier.fixed.items():
         ours = needs.fixed.get(name)
         if ours is not None and not math.isclose(value, ours, rel_tol=1e-9, abs_tol=1e-12):
             reasons.append(f"its simulations had {name} {value:g}, here it is {ours:g}")
-    if not set(known.estimates).intersection(needs.wanted):
-        names = ", ".join(known.estimates)
+    if not set(earlier.estimates).intersection(needs.wanted):
+        names = ", ".join(earlier.estimates)
         reasons.append(f"it is about {names}, which {needs.why}")
     return reasons
 
@@ -453,7 +453,7 @@ def _combined(posteriors: Sequence[KnownPosterior], needs: PriorNeeds, source: P
     return CampaignMemory(tuple(remembered), tuple(left_out), texts, tuple(pours) or None)
 
 
-def _pours_unfit(known: KnownPosterior, needs: PriorNeeds, lost: Sequence[str]) -> str:
+def _pours_unfit(earlier: KnownPosterior, needs: PriorNeeds, lost: Sequence[str]) -> str:
     """Why the pours of a usable posterior say nothing here about the simulator, as text; empty if they do.
 
     Args:
@@ -462,22 +462,22 @@ def _pours_unfit(known: KnownPosterior, needs: PriorNeeds, lost: Sequence[str]) 
     """
     assert needs.poured is not None
     liquid = needs.poured.liquid
-    if not known.weighed or known.liquid.mass is None:
+    if not earlier.weighed or earlier.liquid.mass is None:
         return "its file or its run has none with their simulations"
-    if known.shape != shape_digest(scene_by_content(needs.poured)):
-        return f"they are from another vessel ('{known.pourer}')"
-    if difference := _liquid_differs(known, needs.poured):
+    if earlier.shape != shape_digest(scene_by_content(needs.poured)):
+        return f"they are from another vessel ('{earlier.pourer}')"
+    if difference := _liquid_differs(earlier, needs.poured):
         return difference
-    if not math.isclose(known.liquid.mass, liquid.mass, rel_tol=ALIKE):
-        return f"they are of {1e3 * known.liquid.mass:g} g, here it is {1e3 * liquid.mass:g} g"
-    if known.laboratory != needs.laboratory.name:
-        return f"they are of laboratory '{known.laboratory}', here it is '{needs.laboratory.name}'"
+    if not math.isclose(earlier.liquid.mass, liquid.mass, rel_tol=ALIKE):
+        return f"they are of {1e3 * earlier.liquid.mass:g} g, here it is {1e3 * liquid.mass:g} g"
+    if earlier.laboratory != needs.laboratory.name:
+        return f"they are of laboratory '{earlier.laboratory}', here it is '{needs.laboratory.name}'"
     return f"their simulations have another {', '.join(lost)}" if lost else ""
 
 
-def _liquid_differs(known: KnownPosterior, scene: Scene) -> str:
+def _liquid_differs(earlier: KnownPosterior, scene: Scene) -> str:
     """How the liquid differs from that of a scene, as text; empty if it is the same."""
-    theirs, ours = known.liquid, scene.liquid
+    theirs, ours = earlier.liquid, scene.liquid
     if theirs.name != ours.name:
         return f"it is of '{theirs.name}', here it is '{ours.name}'"
     pairs = {

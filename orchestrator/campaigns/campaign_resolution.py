@@ -90,12 +90,12 @@ def resolve_deployment(
 ) -> DeploymentPlan | None:
     """The plan of a deployment. Problems are added to the report; the plan may then be None."""
     report, settings = builder.report, section.settings
-    known = not report.is_broken(place.at("strategy"))
+    strategy_valid = not report.is_broken(place.at("strategy"))
     ground = StageGround.of(section, builder, place, inherit=True)
     actions = ground.actions
     why = "is what calibration averages over; deployment looks for the best action"
     builder.refuse_prior(section.actions, place, why)
-    if known:
+    if strategy_valid:
         problems = PlacedProblems(place, report, frozenset(DeploymentSection.model_fields))
         settings.check(problems)
     if settings.pours and laboratory is not None and not laboratory.pours:
@@ -115,7 +115,7 @@ def resolve_deployment(
         if scene is None:
             return None  # one cause, one message
         scenes.append(scene)
-    if actions is None or not known:
+    if actions is None or not strategy_valid:
         return None
     if section.objective is not None and not report.is_broken(place.at("objective", "name")):
         section.objective.check(scenes[0], actions, PlacedProblems(place.at("objective"), report))
@@ -159,7 +159,7 @@ def resolve_calibration(
     searched: dict[str, Axis],
     place: Place,
     laboratory: LaboratorySettings | None,
-    known: tuple[NormalPrior, ...] = (),
+    priors: tuple[NormalPrior, ...] = (),
 ) -> CalibrationPlan | None:
     """The plan of a calibration. Problems are added to the report; the plan may then be None.
 
@@ -167,7 +167,7 @@ def resolve_calibration(
         fixed: parameters that are not searched, by name.
         searched: axes of the searched parameters, by name.
         place: place of the section.
-        known: priors of searched parameters.
+        priors: priors of searched parameters.
     """
     report, at = builder.report, place.at("pours")
     ground = StageGround.of(section, builder, place, inherit=False)
@@ -240,7 +240,7 @@ def resolve_calibration(
         records=records,
         transfer=transfer,
         random_baseline=section.random_baseline,
-        parameter_prior=known,
+        parameter_prior=priors,
         further=others,
         tested=unseen,
     )

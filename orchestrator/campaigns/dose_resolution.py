@@ -386,20 +386,20 @@ def _check_places(
     complain: Complain,
 ) -> None:
     """Check that every source and cup has a place in the laboratory."""
-    known = [position.name for position in all_places(laboratory.places)]
+    places = [position.name for position in all_places(laboratory.places)]
     lacks = f"laboratory '{laboratory.name}' has no place"
     ends = [[position.name for position in each.each] for each in laboratory.places]
     named = ", ".join(f"{names[0]} … {names[-1]}" if len(names) > 1 else names[0] for names in ends)
     for name, position in positions.items():
         key, _, number = name.partition(" ")
-        if position not in known and key in ("spares", "proposals"):
+        if position not in places and key in ("spares", "proposals"):
             builder.report.add(place.at("cups", key, int(number)), f"{lacks} '{position}'")
-        elif position not in known:
+        elif position not in places:
             complain(name, "", f"{lacks} '{position}'; there are {named}")
     for i, entry in enumerate(section.liquids or ()):
         for j, stand in enumerate(_stands(entry)):
             at = place.at("liquids", i, "name") if entry.stands is None else place.at("liquids", i, "stands", j)
-            if stand not in known:
+            if stand not in places:
                 builder.report.add(at, f"{lacks} '{stand}'; there are {named}")
 
 

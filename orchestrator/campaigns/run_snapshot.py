@@ -91,12 +91,12 @@ def _deployment(base: Mapping[str, Any], plan: DeploymentPlan) -> dict[str, Any]
     section = base["deployment"]
     named = next(table for table in (section, base) if "receivers" in table or "receiver" in table)
     receivers = named["receivers"] if "receivers" in named else [named["receiver"]]
-    known = {receiver["name"]: receiver for receiver in receivers}
+    records = {receiver["name"]: receiver for receiver in receivers}
     common = {key: value for key, value in _common(section, LearningSettings).items() if key != "receiver"}
     if plan.data is None:
         common.pop("data", None)
     common["confirm"] = plan.confirm
-    vessels = [known.get(scene.receiver.name) or vessel_record(scene.receiver) for scene in plan.scenes]
+    vessels = [records.get(scene.receiver.name) or vessel_record(scene.receiver) for scene in plan.scenes]
     return {**common, "receivers": vessels, **written(plan.settings)}
 
 

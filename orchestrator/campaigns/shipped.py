@@ -20,8 +20,8 @@ def shipped(name: str = "") -> Path:
     root = _root()
     path = root / name
     if not path.exists():
-        known = sorted(str(p.relative_to(root)) for p in root.glob("*/*.yaml"))
-        raise FileNotFoundError(f"Decant comes with no '{name}'; there are {', '.join(known)}")
+        names = sorted(str(p.relative_to(root)) for p in root.glob("*/*.yaml"))
+        raise FileNotFoundError(f"Decant comes with no '{name}'; there are {', '.join(names)}")
     return path
 
 

@@ -119,7 +119,7 @@ def columns_of(
     return columns
 
 
-def _resolved(text: str, known: Sequence[KnownColumn], renamed: Mapping[str, str]) -> FoundColumn:
+def _resolved(text: str, columns: Sequence[KnownColumn], renamed: Mapping[str, str]) -> FoundColumn:
     """The column that a text in a header names.
 
     Raises:
@@ -130,9 +130,9 @@ def _resolved(text: str, known: Sequence[KnownColumn], renamed: Mapping[str, str
     bracketed = _BRACKETS.fullmatch(text)
     stem, unit = (bracketed[1], bracketed[2]) if bracketed else (text, "")
     name = renamed.get(text) or renamed.get(stem, stem)
-    names = {entry.name: entry for entry in known} | {entry.standard: entry for entry in known}
+    names = {entry.name: entry for entry in columns} | {entry.standard: entry for entry in columns}
     word = re.sub(r"[\s-]+", "_", name.strip()).lower()
-    column = names.get(name) or names.get(word) or next((entry for entry in known if word in entry.aliases), None)
+    column = names.get(name) or names.get(word) or next((entry for entry in columns if word in entry.aliases), None)
     alias = column is not None and word in column.aliases
     standard = column is not None and word == column.standard.lower()
     if text in renamed and not is_unit(unit):
@@ -143,17 +143,19 @@ def _resolved(text: str, known: Sequence[KnownColumn], renamed: Mapping[str, str
             raise QuantityError(f"has no unit; {text} if that is what is meant")
         return FoundColumn(column.standard)
     if column is None and not unit:
-        column = next((c for c in known if c.unit and re.fullmatch(rf"{c.name}_[a-zµ°%_0-9]+", word)), None)
+        column = next((c for c in columns if c.unit and re.fullmatch(rf"{c.name}_[a-zµ°%_0-9]+", word)), None)
         if column is not None:
             suffix = name.strip()[len(column.name) + 1 :]
             unit = re.sub(r"(?<=[a-z])(?=[0-9])", "^", suffix.replace("_", "/"))
     if column is None:
         if text in renamed:
             raise QuantityError(f"'columns' gives it the name '{renamed[text]}', which is not known")
-        guess = did_you_mean(word, names) or did_you_mean(word, [entry.standard for entry in known])
+        guess = did_you_mean(word, names) or did_you_mean(word, [entry.standard for entry in columns])
         shown = names[guess].standard if guess else ""
         if not guess:
-            raise _UnknownColumnError(f"unknown column; known columns: {', '.join(entry.standard for entry in known)}")
+            raise _UnknownColumnError(
+                f"unknown column; known columns: {', '.join(entry.standard for entry in columns)}"
+            )
         raise _UnknownColumnError(f"unknown column; did you mean '{shown}'?", shown)
     if not column.unit:
         raise QuantityError(f"'{column.name}' has no unit; remove '{unit}'")

@@ -65,9 +65,9 @@ def posterior_source() -> PosteriorSource:
             catalogue.refresh()
             return catalogue.posterior(name)
 
-    def stale(known: KnownPosterior) -> str:
+    def stale(posterior: KnownPosterior) -> str:
         with Catalogue() as catalogue:
-            age = catalogue.posterior_ages([known]).get(known.posterior)
+            age = catalogue.posterior_ages([posterior]).get(posterior.posterior)
         return "" if age is None else age.text
 
     return PosteriorSource(simulator_version(), every, of_run, stale)
@@ -213,8 +213,8 @@ class Catalogue:
 
         query = "select content from posterior join run using (path) order by begun, path"
         measured_here = [KnownPosterior.model_validate_json(row[0]) for row in self._connection.execute(query)]
-        names = {known.posterior for known in measured_here}
-        return [*measured_here, *(known for known in imported(self.state) if known.posterior not in names)]
+        names = {posterior.posterior for posterior in measured_here}
+        return [*measured_here, *(posterior for posterior in imported(self.state) if posterior.posterior not in names)]
 
     def posterior(self, name: str) -> KnownPosterior:
         """The posterior of a run, or an imported one.
@@ -227,9 +227,9 @@ class Catalogue:
         try:
             return posterior_of(Path(self._find(name)["path"]))
         except NoSuchRunError:
-            for known in imported(self.state):
-                if known.posterior == name:
-                    return known
+            for entry in imported(self.state):
+                if entry.posterior == name:
+                    return entry
             raise
 
     def posterior_ages(self, posteriors: Iterable[KnownPosterior]) -> dict[str, PosteriorAge]:

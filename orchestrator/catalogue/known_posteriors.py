@@ -192,21 +192,21 @@ class PosteriorAge(BaseModel):
         return f"{off}; a calibration with {plural(self.renewing_pours, 'pour')} would renew it"
 
 
-def age_of(known: KnownPosterior, made: float, charts: Iterable[LaboratoryChart]) -> PosteriorAge:
+def age_of(posterior: KnownPosterior, made: float, charts: Iterable[LaboratoryChart]) -> PosteriorAge:
     """The age of a posterior: later pours disagree if the prediction error has left its limits since it was made.
 
     Args:
-        known: the posterior.
+        posterior: the posterior.
         made: when its run ended [s since 1970].
         charts: of all laboratories.
     """
-    age = PosteriorAge(made=made, later_pours=0, renewing_pours=known.pours)
-    bench = (known.laboratory, known.mode, "prediction_error")
+    age = PosteriorAge(made=made, later_pours=0, renewing_pours=posterior.pours)
+    bench = (posterior.laboratory, posterior.mode, "prediction_error")
     chart = next((chart for chart in charts if (chart.laboratory, chart.mode, chart.quantity) == bench), None)
     if chart is None:
         return age
     # The day on which it was made may have pours from before it, and its own deployment.
-    vessels = {", ".join((known.pourer, receiver, known.liquid.name)) for receiver in known.receivers}
+    vessels = {", ".join((posterior.pourer, receiver, posterior.liquid.name)) for receiver in posterior.receivers}
     later = [point for point in chart.points if point.time > made and point.about in vessels]
     age.later_pours = sum(point.pours for point in later)
     lasting = chart.lasting
@@ -231,7 +231,7 @@ def imported(state: Path | None = None) -> Iterable[KnownPosterior]:
             raise NoPosteriorError(f"{path}: is damaged ({error}); delete it, and import the posterior again") from None
 
 
-def import_posterior(known: KnownPosterior, state: Path | None = None) -> None:
+def import_posterior(posterior: KnownPosterior, state: Path | None = None) -> None:
     """Enter a posterior, which replaces one of the same run.
 
     Raises:
@@ -240,14 +240,14 @@ def import_posterior(known: KnownPosterior, state: Path | None = None) -> None:
     folder = (state or state_directory()) / FOLDER
     make_state_directory(folder.parent)
     folder.mkdir(exist_ok=True)
-    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in known.posterior)
+    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in posterior.posterior)
     path = folder / f"{name}.json"
     partial = path.with_suffix(".part")
-    partial.write_text(known.model_dump_json(), encoding="utf-8")
+    partial.write_text(posterior.model_dump_json(), encoding="utf-8")
     partial.replace(path)
 
 
-def posterior_text(known: KnownPosterior) -> str:
+def posterior_text(posterior: KnownPosterior) -> str:
     """A posterior as a YAML file, with units as they are displayed."""
     from ruamel.yaml import YAML
 
@@ -255,17 +255,17 @@ def posterior_text(known: KnownPosterior) -> str:
     yaml = YAML()
     yaml.default_flow_style = None
     yaml.width = 110
-    yaml.dump(posterior_table(known), text)
+    yaml.dump(posterior_table(posterior), text)
     return text.getvalue()
 
 
-def posterior_table(known: KnownPosterior) -> dict[str, Any]:
+def posterior_table(posterior: KnownPosterior) -> dict[str, Any]:
     """A posterior as the content of its file, with units as they are displayed."""
-    table: dict[str, Any] = written(known)
+    table: dict[str, Any] = written(posterior)
     infos = SimulationParameters.info()
     table["parameters"] = {
         name: {"mean": _shown(mean, infos[name]), "deviation": _shown(deviation, infos[name])}
-        for name, (mean, deviation) in known.estimates.items()
+        for name, (mean, deviation) in posterior.estimates.items()
     }
     return table
 

@@ -202,8 +202,8 @@ def add_group(app: typer.Typer, name: str, text: str, *shown: str, quiet: bool =
         shown: examples: how its commands are used together.
         quiet: whether its commands have the option `--quiet`.
     """
-    known = (group.typer_instance for group in app.registered_groups)
-    group = next((each for each in known if each is not None and each.info.name == name), None)
+    groups = (group.typer_instance for group in app.registered_groups)
+    group = next((each for each in groups if each is not None and each.info.name == name), None)
     if group is None:
         group = typer.Typer(
             name=name, no_args_is_help=True, rich_markup_mode="markdown", help=text, epilog=examples(*shown)

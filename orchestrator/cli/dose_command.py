@@ -107,8 +107,8 @@ def _dose_request(
         raise RefusalError(f"--amount: {text}")
     scenes = {scene.receiver.name: scene for scene in reversed(dose_scenes(plan))}
     if receiver is not None and receiver not in scenes:
-        known = ", ".join(reversed(scenes))
-        raise RefusalError(f"--receiver {receiver}: the campaign has no such receiver; there are {known}")
+        names = ", ".join(reversed(scenes))
+        raise RefusalError(f"--receiver {receiver}: the campaign has no such receiver; there are {names}")
     with Refused(QuantityError, at="--tolerance: "):
         limit = typed_quantity(tolerance, "kg", "1 g")
     with Refused(QuantityError, at="--amount: "):
@@ -138,8 +138,8 @@ def _predict(plan: CampaignPlan) -> None:
     from orchestrator.learning.trials import SeedStream
 
     assert plan.dispense is not None
-    series, known = plan.dispense, _known(plan.dispense)
-    strategy, seeds = dose_strategy(series, plan.seed, known), SeedStream(plan.seed, "predict doses")
+    series, contents = plan.dispense, _known(plan.dispense)
+    strategy, seeds = dose_strategy(series, plan.seed, contents), SeedStream(plan.seed, "predict doses")
     count = 20 if len(series.doses) == 1 else 8
     total, filled = 0.0, 0
     for planned in series.doses:

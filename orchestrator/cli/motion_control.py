@@ -338,12 +338,12 @@ class Jogging:
 
     def step(self, step: JogStep) -> None:
         """Move one step; the first step along each axis and direction is confirmed."""
-        known = (step.axis, step.amount > 0.0)
-        if known not in self._known:
+        direction = (step.axis, step.amount > 0.0)
+        if direction not in self._known:
             if self._read(f"{step}: Enter moves, anything else doesn't > ").strip():
                 self._print("not moved")
                 return
-            self._known.add(known)
+            self._known.add(direction)
         self._move(step)
         self.where()
 

@@ -426,7 +426,7 @@ def estop(
             )
             return
         stopped = client.emergency_stop(reason, rig)
-    known_rig = any(known["name"] == rig and known["mode"] != "none" for known in stopped.get("rigs", ()))
+    known_rig = any(each["name"] == rig and each["mode"] != "none" for each in stopped.get("rigs", ()))
     of, option = (f" of {rig}", f" --rig {rig}") if known_rig else ("", "")
     print(f"EMERGENCY STOP{of}: the work is abandoned; nothing starts there before 'decant estop --clear{option}'")
     for note in stopped["notes"]:

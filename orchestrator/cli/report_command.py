@@ -44,8 +44,8 @@ def _nothing_there(folder: Path) -> str:
     if has_begun(folder / JOURNAL_NAME):
         return f"{folder}: {check_journal(folder / JOURNAL_NAME).verdict}"
     near = sorted(path.parent.name for path in folder.absolute().parent.glob(f"*/{JOURNAL_NAME}"))
-    known = f"; runs there: {', '.join(near)}" if near else ""
-    return f"{folder}: no run is here; name a run's folder (with its {JOURNAL_NAME}){known}"
+    hint = f"; runs there: {', '.join(near)}" if near else ""
+    return f"{folder}: no run is here; name a run's folder (with its {JOURNAL_NAME}){hint}"
 
 
 def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> Path:

@@ -299,8 +299,8 @@ def teach(
     others = all_places([other for other in spec.places if other.name != name])
     problems = [] if place.rack is None else [text for text in [rack_problem(place)] if text]
     if not problems:
-        found = arm_kind(arm).place_problems([*others, *place.each], {})
-        problems = [text for number, text in found if number >= len(others)]
+        place_problems = arm_kind(arm).place_problems([*others, *place.each], {})
+        problems = [text for number, text in place_problems if number >= len(others)]
     if problems:
         raise RefusalError("nothing is written: " + "; ".join(problems))
     with Refused(OSError):
@@ -327,9 +327,9 @@ def _rack(before: PlaceSettings | None, text: str | None, labware: Path | None) 
     from actors.places import RackSettings
     from orchestrator.campaigns.place_writing import first_problem, labware_rack
 
-    known = None if before is None else before.rack
+    rack = None if before is None else before.rack
     if text is None and labware is None:
-        return known, 0.0
+        return rack, 0.0
     if before is not None or (text is not None and labware is not None):
         raise RefusalError("'--rack' or '--labware' begin a new place; remove it, or change 'rack' in the file")
     if labware is not None:
@@ -367,8 +367,8 @@ def try_place(laboratory: Laboratory, name: PlaceName, enable_motion: EnableMoti
     places = all_places(spec.places)
     place = next((p for p in places if p.name == name), None)
     if place is None:
-        known = ", ".join(f"'{p.name}'" for p in spec.places) or "none"
-        raise RefusalError(f"{laboratory}: there is no place '{name}'; there are {known}")
+        names = ", ".join(f"'{p.name}'" for p in spec.places) or "none"
+        raise RefusalError(f"{laboratory}: there is no place '{name}'; there are {names}")
     lines = f"from home to the place '{name}' and back, at a quarter of the usual speed"
     with _session(laboratory, "try", lines, enable_motion) as (driver, arm):
         way = arm_kind(arm).way(place, places, {}).slowed(TRIED)

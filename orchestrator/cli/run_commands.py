@@ -192,9 +192,9 @@ def chart_command(
     check_output(png, "--png", ".png")
     with _catalogue() as catalogue, _refusing():
         charts = catalogue.charts(_conditions(asked))
-    if laboratory is not None and laboratory not in (known := {chart.laboratory for chart in charts}):
+    if laboratory is not None and laboratory not in (laboratories := {chart.laboratory for chart in charts}):
         raise RefusalError(
-            f"{laboratory}: no weighed pour of this laboratory; known: {', '.join(sorted(known)) or 'none'}"
+            f"{laboratory}: no weighed pour of this laboratory; known: {', '.join(sorted(laboratories)) or 'none'}"
         )
     charts = [chart for chart in charts if laboratory in (None, chart.laboratory)]
     benches = list(dict.fromkeys((chart.laboratory, chart.mode) for chart in charts))
@@ -514,8 +514,8 @@ def _count_of_pours(run: Row) -> str:
 def _action(values: Mapping[str, float | None]) -> str:
     """Format an action: 'angular velocity 41.2 deg/s, x offset 112 mm'."""
     units = _units()
-    known = ((name, value) for name, value in values.items() if value is not None)
-    return ", ".join(f"{_words(name)} {value:.4g} {units.get(name, '')}" for name, value in known)
+    present = ((name, value) for name, value in values.items() if value is not None)
+    return ", ".join(f"{_words(name)} {value:.4g} {units.get(name, '')}" for name, value in present)
 
 
 def _units() -> dict[str, str]:

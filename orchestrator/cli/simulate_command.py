@@ -71,16 +71,16 @@ def simulate(
 
     plan = read_campaign(campaign)
     draws = read_draws(parameters, thetas, seeds, plan.parameters)
-    known = PredictionInputs(plan.parameters)
+    inputs = PredictionInputs(plan.parameters)
     if parameters is not None:
-        known = PredictionInputs(load_parameters(parameters, plan.parameters), draws, load_discrepancy(parameters))
+        inputs = PredictionInputs(load_parameters(parameters, plan.parameters), draws, load_discrepancy(parameters))
     vessel = None if receiver is None else load_vessel(receiver)
     scene, space = scene_to_simulate(plan, scene_name)
     if vessel is not None:
         scene = dataclasses.replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)
     with Refused(ValueError, at="--set: "):
         action = assigned_action(assignments or [], fixed=scene.fixed, space=space)
-    known = known.at(scene)
+    inputs = inputs.at(scene)
     check_output(rrd, "--rrd", ".rrd")
     check_output(png, "--png", ".png")
     wanted = wanted_in(plan, scene, scene_name)
@@ -88,7 +88,7 @@ def simulate(
     if problems:
         raise RefusalError("\n".join(map(str, problems)))
     frame_rate = 20.0 if rrd or png else 0.0
-    tasks = known.tasks(scene, action, seed, seeds, frame_rate)
+    tasks = inputs.tasks(scene, action, seed, seeds, frame_rate)
     simulator = PourSimulator()
     with Refused(InvalidSceneError, at="with shapes that the vessels may have, " if scene.uncertain else ""):
         for task in tasks if scene.uncertain else tasks[:1]:  # refuse before Taichi starts
@@ -97,7 +97,7 @@ def simulate(
     runs = _simulated_pour(simulator, tasks)
     outcomes = [run.outcome for run in runs]
     _show(tasks[0], runs[0], rrd, png)
-    over_seeds, where = spreads(outcomes), band_of(outcomes, known.residual)
+    over_seeds, where = spreads(outcomes), band_of(outcomes, inputs.residual)
     received = over_seeds.get("received")
     delivered = None if received is None else received.mean * scene.liquid.mass
     if as_json:
@@ -107,8 +107,8 @@ def simulate(
             SimulateOutput(
                 **outcomes[0].as_json(),
                 action=action.values(),
-                theta=known.theta,
-                thetas=len(known.drawn),
+                theta=inputs.theta,
+                thetas=len(inputs.drawn),
                 scene=scene.name,
                 delivered_g=None if delivered is None else 1e3 * delivered,
                 delivered_ml=None if delivered is None else scene.liquid.millilitres(delivered),
@@ -125,7 +125,7 @@ def simulate(
         print(told(outcomes, over_seeds, amount))
         if where is not None:
             spilled = over_seeds["spillage"].percent()
-            print(f"spilled / poured {spilled}, a pour: {where.percent()}   ({known.said(scene)})")
+            print(f"spilled / poured {spilled}, a pour: {where.percent()}   ({inputs.said(scene)})")
     bad = [f"seed {o.seed}: this outcome must not be used: {o.invalid}" for o in outcomes if o.invalid is not None]
     if bad:
         raise RefusalError("\n".join(bad), FAILED)

@@ -623,9 +623,9 @@ def receiver_names(plan: CampaignPlan) -> dict[str, str]:
         distinct = len({scene.receiver.name for scene in scenes}) == len(scenes)
         names = {scene.name: scene.receiver.name if distinct else scene.name for scene in scenes}
     if plan.calibration is not None:
-        for known in (plan.calibration.records, plan.calibration.transfer):
-            if known is not None:
-                names.setdefault(known.scene.name, known.scene.receiver.name)
+        for pours in (plan.calibration.records, plan.calibration.transfer):
+            if pours is not None:
+                names.setdefault(pours.scene.name, pours.scene.receiver.name)
         for scene in plan.calibration.poured:
             names.setdefault(scene.name, scene.receiver.name)
     for scene in (*(() if plan.dispense is None else plan.dispense.scenes), *filter(None, [plan.pour])):

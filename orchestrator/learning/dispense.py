@@ -320,7 +320,7 @@ class Dispensed(StageResult):
         doses = {dose.liquid: dose for dose in self.doses if cup.contains(dose)}
         order = {liquid: dose.number for liquid, dose in doses.items()}
         masses = {liquid: dose.received_g for liquid, dose in doses.items()}
-        known = cup.state in ("full", "missed") and all(mass is not None for mass in masses.values())
+        complete = cup.state in ("full", "missed") and all(mass is not None for mass in masses.values())
         total = sum(mass or 0.0 for mass in masses.values())
         errors = {liquid: dose.deviation_g for liquid, dose in doses.items() if dose.deviation_g is not None}
         components = []
@@ -328,7 +328,7 @@ class Dispensed(StageResult):
             cup.wanted_g.items(), key=lambda item: (order.get(item[0], len(self.doses)), item)
         ):
             dose = doses.get(liquid)
-            share = (masses[liquid] or 0.0) / total if known and total > 0.0 else None
+            share = (masses[liquid] or 0.0) / total if complete and total > 0.0 else None
             components.append(
                 MixedComponent(
                     cup=cup.position,
@@ -435,9 +435,9 @@ class Dispense:
         """The source of a dose: the first one that holds enough; if there is none, the fullest is filled."""
         names = self._plan.sources_of(planned)
         for name in names:
-            known = self._sources.get(name)
-            if known is not None and self._holds(known, planned):
-                return self._source(name, known, fill=False)
+            content = self._sources.get(name)
+            if content is not None and self._holds(content, planned):
+                return self._source(name, content, fill=False)
         unknown = [name for name in names if name not in self._sources]
         name = unknown[0] if unknown else max(names, key=lambda one: self._sources[one].mass)
         scene = self._plan.scene(name, planned.receiver)
@@ -454,13 +454,13 @@ class Dispense:
         """Set the content of a source, for a forecast of the doses after it."""
         self._sources[name] = content
 
-    def _holds(self, known: KnownSource, planned: PlannedDose) -> bool:
-        sure = known.mass - ENOUGH * known.deviation
-        return sure > planned.amount + planned.limit and known.mass - planned.amount >= self._plan.refill_below
+    def _holds(self, content: KnownSource, planned: PlannedDose) -> bool:
+        sure = content.mass - ENOUGH * content.deviation
+        return sure > planned.amount + planned.limit and content.mass - planned.amount >= self._plan.refill_below
 
-    def _source(self, name: str, known: KnownSource, *, fill: bool) -> DoseSource:
-        knowledge = self._calibrated.get(name) if known.knowledge is None else _knowledge(known.knowledge)
-        return DoseSource(name, known.mass, known.deviation, fill, self._constants, knowledge)
+    def _source(self, name: str, content: KnownSource, *, fill: bool) -> DoseSource:
+        knowledge = self._calibrated.get(name) if content.knowledge is None else _knowledge(content.knowledge)
+        return DoseSource(name, content.mass, content.deviation, fill, self._constants, knowledge)
 
     def take(self, pour: Pour, outcome: Outcome | None) -> None:
         """Record a dose without a request, for the result of a run that has not finished; None: it is under way."""

@@ -66,9 +66,11 @@ class StageResult(ResultPart):
         kind = cls.model_fields["kind"].default
         if not isinstance(kind, str):
             raise TypeError(f"{cls.__qualname__} has to declare its kind: kind: Literal['…'] = '…'")
-        known = StageResult.KINDS.setdefault(kind, cls)
-        if (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
-            raise TypeError(f"{cls.__qualname__}: {known.__qualname__} has the kind '{kind}' already; choose another")
+        registered = StageResult.KINDS.setdefault(kind, cls)
+        if (registered.__module__, registered.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise TypeError(
+                f"{cls.__qualname__}: {registered.__qualname__} has the kind '{kind}' already; choose another"
+            )
 
 
 class DisplayedMap(ResultPart):

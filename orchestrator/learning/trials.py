@@ -48,8 +48,8 @@ class Trial:
     @property
     def cost(self) -> float | None:
         """Mean cost of the simulations that have one; None if none has."""
-        known = [cost for _, cost in sorted(self.costs.items()) if cost is not None]
-        return sum(known) / len(known) if known else None
+        defined = [cost for _, cost in sorted(self.costs.items()) if cost is not None]
+        return sum(defined) / len(defined) if defined else None
 
 
 class Trials:
@@ -111,7 +111,7 @@ class Trials:
 
     def abandon(self, trial: Trial) -> int:
         """Remove the simulations of a trial that have not been requested yet, and return their number."""
-        number = next(i for i, known in enumerate(self.all) if known is trial)
+        number = next(i for i, other in enumerate(self.all) if other is trial)
         queued = [place for place in self._unissued if place[0] == number]
         self._unissued = deque(place for place in self._unissued if place[0] != number)
         trial.requests = trial.requests[: len(trial.requests) - len(queued)]

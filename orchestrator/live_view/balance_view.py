@@ -189,9 +189,9 @@ class BalanceStage:
         if running.tilted is not None and np.isfinite(self._scale) and running.shown:
             walls, grams = np.array(running.shown).T
             at = running.tilted + times / self._scale
-            known = at <= walls[-1] + 1.0
-            net = np.interp(at[known], walls, grams) - (running.tared or 0.0)
-            tracks.append(self._curve("pour/weighed", times[known], net))
+            covered = at <= walls[-1] + 1.0
+            net = np.interp(at[covered], walls, grams) - (running.tared or 0.0)
+            tracks.append(self._curve("pour/weighed", times[covered], net))
         if running.verdict is not None:
             tracks.append(self._curve("pour/verdict", times[-1:], np.array([running.verdict])))
         return tracks
@@ -204,16 +204,16 @@ class BalanceStage:
         return Track(f"{PLACE}/{name}", times, columns_of(rr.Scalars.columns(scalars=values)))
 
     def _predicted(self, pour: Pour, scene: Scene) -> tuple[FloatArray, FloatArray | None]:
-        known = self._simulated.get(pour.scene, [])
+        simulated = self._simulated.get(pour.scene, [])
         wanted = _numbers(pour.action.values())
-        if not known:
+        if not simulated:
             return np.zeros(0), None
         names = sorted(wanted)
-        places = np.array([[_numbers(action.values()).get(n, wanted[n]) for n in names] for action, _ in known])
+        places = np.array([[_numbers(action.values()).get(n, wanted[n]) for n in names] for action, _ in simulated])
         spread = np.ptp(places, axis=0)
         away = (places - np.array([wanted[n] for n in names])) / np.where(spread > 0.0, spread, 1.0)
         nearest = np.argsort(np.linalg.norm(away, axis=1), kind="stable")[:NEAREST]
-        outcomes = [known[int(i)][1] for i in nearest]
+        outcomes = [simulated[int(i)][1] for i in nearest]
         end = max(outcome.curve_times[-1] for outcome in outcomes)
         times = np.linspace(0.0, end, 80)
         grams = 1e3 * scene.liquid.mass

@@ -207,11 +207,11 @@ class CellScene:
             return self._figure.tool(moves[1][::5])[:, :3]
         return np.zeros((0, 3)) if liquid is None else np.asarray(liquid.pourer_poses, float)[:, :3]
 
-    def _moved(self, times: FloatArray, known: FloatArray, joints: FloatArray) -> list[Track]:
+    def _moved(self, times: FloatArray, joint_times: FloatArray, joints: FloatArray) -> list[Track]:
         """Return the arm's tracks at times (T,) [s], from joints (K, n) [rad] known at other times (K,) [s]."""
         figure = self._figure
         assert figure is not None
-        stands = np.column_stack([np.interp(times, known, column) for column in joints.T])
+        stands = np.column_stack([np.interp(times, joint_times, column) for column in joints.T])
         some = shapes.changes(stands)
         when, stands = times[some], stands[some]
         return [

@@ -144,10 +144,10 @@ class LearningStage:
         if deploying and self._plan.deployment is not None:
             unit = deployment_unit(self._plan.deployment)
         subject = self._names.get(scene or "", scene or "") if deploying else "θ"
-        known = plural(len(query.data), "observation")
+        observed = plural(len(query.data), "observation")
         if simulations := len(simulated_points(query)):
-            known = f"{plural(len(query.data), 'pour')} and {plural(simulations, 'simulation')}"
-        title = f"{subject}: estimates after {known}"
+            observed = f"{plural(len(query.data), 'pour')} and {plural(simulations, 'simulation')}"
+        title = f"{subject}: estimates after {observed}"
         self._picture(
             f"{PLACE}/{where}/surrogate",
             event.time,

@@ -113,9 +113,9 @@ class MachineView:
         entity = f"{PLACE}/activity/{safe_name(name)}"
         if entity not in self._styled:
             self._styled.add(entity)
-            known = list(_PURPOSES)
-            colours = [shapes.rgb(_PURPOSES[each]) for each in known]
-            appearance = rr.StateConfiguration(values=known, labels=known, colors=colours)
+            purposes = list(_PURPOSES)
+            colours = [shapes.rgb(_PURPOSES[each]) for each in purposes]
+            appearance = rr.StateConfiguration(values=purposes, labels=purposes, colors=colours)
             self._sink.log(entity, appearance, static=True)
         self._sink.log(entity, rr.StateChange(state=doing or IDLE))
 

@@ -217,7 +217,7 @@ class CampaignRecording:
                 self._simulation(event, request, outcome)
             case Pour() as request, Poured(measured):
                 self._learning.about(event.stage, request.scene)
-                pour = next(known for known in self._progress.run.pours if known.id == event.id)
+                pour = next(made for made in self._progress.run.pours if made.id == event.id)
                 best = self._progress.best.get(request.scene)
                 self._say(self._learning.poured(pour, measured, best), source=event.stage)
                 shown = self._balance.finish(measured)

@@ -538,12 +538,12 @@ class VesselAccount:
             mass = 0.0
         self.add_component(cup, liquid, mass, deviation, source)
         parts = [part for part in self.composition(cup) if part.liquid and part.mass != 0.0]
-        known = None
+        content = None
         if all(part.mass is not None for part in parts):
             spread = math.hypot(*(part.deviation for part in parts))
-            known = KnownSource(mass=math.fsum(part.mass or 0.0 for part in parts), deviation=spread)
-        kind: EntryKind = "begun" if outcome is None else "unknown" if known is None else "poured"
-        self._note_dose(cup, kind, known, key, parts[0].liquid if len(parts) == 1 else MIXTURE if parts else "")
+            content = KnownSource(mass=math.fsum(part.mass or 0.0 for part in parts), deviation=spread)
+        kind: EntryKind = "begun" if outcome is None else "unknown" if content is None else "poured"
+        self._note_dose(cup, kind, content, key, parts[0].liquid if len(parts) == 1 else MIXTURE if parts else "")
 
     def follow(self, plan: DispensePlan, *, carried: bool = False) -> Callable[[Event], None]:
         """A subscriber that writes the doses of a run.

@@ -163,14 +163,14 @@ def _places(table: SavedTable, names: Mapping[str, str]) -> tuple[dict[str, int]
             problems.append(table.problem(table.header, None, "", text))
     places: dict[str, int] = {}
     factors: dict[str, float] = {}
-    for known in COLUMNS:
+    for entry in COLUMNS:
         for place, column in enumerate(columns):
-            if column is not None and column.standard == known.standard:
-                places[known.name] = place
-                factors[known.name] = column.factor * parse_unit(known.display, known.unit, f"1 {known.display}")
-        if known is not TILT and known.name not in places and not problems:
+            if column is not None and column.standard == entry.standard:
+                places[entry.name] = place
+                factors[entry.name] = column.factor * parse_unit(entry.display, entry.unit, f"1 {entry.display}")
+        if entry is not TILT and entry.name not in places and not problems:
             hint = f"; or map one of {', '.join(map(repr, unread[:6]))} with 'columns'" if unread else ""
-            text = f"has no column of the {known.name}; name one '{known.standard}' or '{known.name} [unit]'{hint}"
+            text = f"has no column of the {entry.name}; name one '{entry.standard}' or '{entry.name} [unit]'{hint}"
             problems.append(table.problem(table.header, None, "", text))
     if problems:
         raise ConfigError(problems)

@@ -355,14 +355,14 @@ def decode_result(data: Mapping[str, Any]) -> StageResult:
         from orchestrator.learning.strategy_registry import result_kinds
 
         result_kinds()  # the kind may belong to a package that is not loaded yet
-    known = StageResult.KINDS.get(str(kind))
-    if known is None:
+    result_type = StageResult.KINDS.get(str(kind))
+    if result_type is None:
         raise RunError(
             f"a result of the kind '{kind}' is not known; is the package installed whose strategy learnt it? "
             f"Known are: {', '.join(sorted(StageResult.KINDS))}"
         )
     try:
-        return known.model_validate(from_json(data))
+        return result_type.model_validate(from_json(data))
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(key) for key in first["loc"])

@@ -422,9 +422,9 @@ class RunState:
             case Requested(request=Ask(text)) | OperatorAsked(question=text):
                 self._question(event, text)
             case OperatorAnswered():
-                for known in (self._questions.get(event.id), self._pours.get(event.id)):
-                    if known is not None:
-                        known.answer = event.answer
+                for asked_for in (self._questions.get(event.id), self._pours.get(event.id)):
+                    if asked_for is not None:
+                        asked_for.answer = event.answer
             case DecisionMade(decision=decision):
                 self.decisions.append(
                     RecordedDecision(event.time, event.stage, decision.text, decision.values, stage.simulations_asked)
@@ -477,19 +477,19 @@ class RunState:
             self.failures[failed.partition(":")[0]] += 1
 
 
-def read_record(directory: Path, *, slots: int = 1, known: RunState | None = None) -> RunState:
+def read_record(directory: Path, *, slots: int = 1, earlier: RunState | None = None) -> RunState:
     """Read the journal of a run, finished or not.
 
     Args:
         directory: folder of the run.
         slots: maximum number of simulations at a time, for the use of the pool.
-        known: what was read before; it takes the events that were added since, and is returned.
+        earlier: what was read before; it takes the events that were added since, and is returned.
 
     Raises:
         RunError: there is no journal, it is damaged, or a pour can't be decoded.
     """
     with JournalReader(directory / JOURNAL_NAME) as journal:
-        record = known or RunState(journal.header, slots, journal.header.created)
+        record = earlier or RunState(journal.header, slots, journal.header.created)
         for seq, event in journal.events(record.open_requests, after=record.entries):
             record.take(event)
             record.entries = seq

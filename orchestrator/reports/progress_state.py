@@ -95,8 +95,8 @@ class ProgressState:
         for pour in self.run.weighed:
             if pour.request.purpose == CONFIRM or (loss := minimised_loss(self.plan, pour)) is None:
                 continue
-            known = best.get(pour.request.scene)
-            if known is None or loss < known.loss:
+            earlier = best.get(pour.request.scene)
+            if earlier is None or loss < earlier.loss:
                 unit = unit_of_pour(self.plan, pour.request)
                 best[pour.request.scene] = Best(loss, pour.request.number, unit)
         return best

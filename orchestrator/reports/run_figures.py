@@ -174,16 +174,16 @@ def calibration_picture(plan: CampaignPlan, result: Calibrated) -> SurrogatePict
     """The discrepancy over θ; None if the plan calibrates nothing or no trial has a discrepancy."""
     if plan.calibration is None:
         return None
-    known = [(trial.theta, trial.discrepancy) for trial in result.trials if trial.discrepancy is not None]
+    trials = [(trial.theta, trial.discrepancy) for trial in result.trials if trial.discrepancy is not None]
     shown = None if result.found is None else result.found.map
-    if not known and shown is None:
+    if not trials and shown is None:
         return None
     return SurrogatePicture(
         title=f"Discrepancy over θ: {', '.join(scene.receiver.name for scene in plan.calibration.scenes)}",
         cost=DISCREPANCY.label,
         space=plan.calibration.parameters,
-        points=[theta for theta, _ in known],
-        costs=[DISCREPANCY.factor * discrepancy for _, discrepancy in known],
+        points=[theta for theta, _ in trials],
+        costs=[DISCREPANCY.factor * discrepancy for _, discrepancy in trials],
         best=None if result.found is None else result.found.theta.model_dump(),
         largest=DISCREPANCY.factor,
         **_surrogate(shown, DISCREPANCY),
@@ -195,18 +195,18 @@ def deployment_picture(plan: CampaignPlan, result: Deployed) -> SurrogatePicture
     if plan.deployment is None:
         return None
     unit = deployment_unit(plan.deployment)
-    known = [(pour, pour.loss) for pour in result.weighed if pour.loss is not None]
-    if not known and result.map is None:
+    pours = [(pour, pour.loss) for pour in result.weighed if pour.loss is not None]
+    if not pours and result.map is None:
         return None
     return SurrogatePicture(
         title=f"Loss over actions: {receiver_name(plan, result.scene)} ({result.strategy})",
         cost=unit.label,
         space=plan.deployment.actions,
-        points=[pour.action_si for pour, _ in known],
-        costs=[unit.factor * loss for _, loss in known],
+        points=[pour.action_si for pour, _ in pours],
+        costs=[unit.factor * loss for _, loss in pours],
         best=None if result.recommended is None else result.recommended.action_si,
         best_name="best action",
-        numbers=[pour.number for pour, _ in known],
+        numbers=[pour.number for pour, _ in pours],
         simulated=[simulation.action_si for simulation in result.simulated],
         largest=unit.factor * largest_loss(plan.deployment),
         **_surrogate(result.map, unit),

@@ -153,10 +153,10 @@ def summarise_record(
     ]
     if theta := catalogued.get("theta"):
         about.append(f"θ* (SI units): {_plain(theta)}.")
-    known = _of_record(record, run, check)
-    known["standing"] = (f"This report is reduced to what the journal has. {reason}", *known["standing"])
+    fields = _of_record(record, run, check)
+    fields["standing"] = (f"This report is reduced to what the journal has. {reason}", *fields["standing"])
     return RunSummary(
-        **known,
+        **fields,
         campaign=record.header.name,
         seed=catalogued.get("seed"),
         mode=catalogued.get("mode") or "none",

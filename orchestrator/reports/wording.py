@@ -331,8 +331,8 @@ def identified_viscosity(posterior: PosteriorSummary, liquid: Liquid) -> list[st
         return []
     declared = 1e3 * liquid.dynamic_viscosity
     low, high = (f"{declared * factor:.3g}" for factor in posterior.region["viscosity_factor"])
-    known = f"{low} … {high} mPa*s ({100 * posterior.level:.0f} %; declared {declared:.3g} mPa*s)"
-    return [f"Viscosity of {liquid.name}, by these pours: {known}."]
+    interval = f"{low} … {high} mPa*s ({100 * posterior.level:.0f} %; declared {declared:.3g} mPa*s)"
+    return [f"Viscosity of {liquid.name}, by these pours: {interval}."]
 
 
 def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
@@ -342,17 +342,17 @@ def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
         posterior: posterior of a calibration's result.
         space: searched θ.
     """
-    known, unknown = [], []
+    identified, unknown = [], []
     for axis in space.axes:
         words, searched = axis.name.replace("_", " "), style.display_interval(axis.name, axis.lower, axis.upper)
         if axis.name in posterior.open:
             unknown.append(f"{words} ({searched})")
         else:
             interval = style.display_interval(axis.name, *posterior.region[axis.name])
-            known.append(f"{words} {interval} (searched {searched})")
+            identified.append(f"{words} {interval} (searched {searched})")
     lines = []
-    if known:
-        lines.append(f"{100 * posterior.level:.0f} % of the θ that fit the pours have {', '.join(known)}")
+    if identified:
+        lines.append(f"{100 * posterior.level:.0f} % of the θ that fit the pours have {', '.join(identified)}")
     if unknown:
         lines.append(
             f"the pours do not determine {', '.join(unknown)}: nearly the whole searched range fits them as well as θ*"
@@ -365,17 +365,17 @@ def without_advice(plan: CampaignPlan, record: RunState, learning: RunLearning) 
     if plan.deployment is not None and any(name.startswith("deployment") for name in record.stages):
         lines = ["No action is recommended yet: the result of a deployment is written when its stage ends."]
         losses = {loss: pour for pour in record.weighed if (loss := minimised_loss(plan, pour)) is not None}
-        known = list(losses)
-        if known:
-            action = losses[min(known)].request.action.values()
+        weighed = list(losses)
+        if weighed:
+            action = losses[min(weighed)].request.action.values()
             best = style.display_values({name: action[name] for name in plan.deployment.actions.names})
             unit = deployment_unit(plan.deployment)
             of = (
-                f"The smallest loss of {len(known)} pours so far"
-                if len(known) > 1
+                f"The smallest loss of {len(weighed)} pours so far"
+                if len(weighed) > 1
                 else "The loss of the only pour so far"
             )
-            lines.append(f"{of} is {unit.text(min(known))}, with {best}.")
+            lines.append(f"{of} is {unit.text(min(weighed))}, with {best}.")
         return lines
     if learning.calibrated_theta is not None:
         error = unfitted_error(learning)

@@ -193,7 +193,7 @@ def _opened(directory: Path | str) -> tuple[Path, CampaignPlan]:
 
 def _replayed(campaign: CampaignPlan, stage: str, history: StageHistory, results: Results) -> Strategy:
     """The strategy of a stage after its history: what it refuses must not be written, or no run could continue."""
-    definition = next(known for known in stages_of(campaign) if known.name == stage)
+    definition = next(each for each in stages_of(campaign) if each.name == stage)
     strategy = definition.build(results, history.seed or 0)
     replay(strategy, history, stage)
     return strategy

@@ -138,10 +138,10 @@ class SpeculativeExecution:
 
     async def take(self, request: Simulate) -> Outcome | None:
         """Outcome of a simulation that is requested now, if it ran speculatively; None: it must be run."""
-        if (known := self._known.pop(request, None)) is not None:
+        if (answer := self._known.pop(request, None)) is not None:
             self.used += 1
             self._fill()
-            return known
+            return answer
         if (task := self._running.pop(request, None)) is None:
             return None
         with self.asked_for():
@@ -516,8 +516,8 @@ class RequestExecutor:
         try:
             return self._scenes[name]
         except KeyError:
-            known = ", ".join(sorted(self._scenes)) or "none"
-            raise RequestExecutorError(f"a request names the scene '{name}', but the plan has {known}") from None
+            names = ", ".join(sorted(self._scenes)) or "none"
+            raise RequestExecutorError(f"a request names the scene '{name}', but the plan has {names}") from None
 
 
 def _refusal(scene: Scene, action: Action, arm: ArmSettings) -> str:

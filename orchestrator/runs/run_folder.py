@@ -196,8 +196,8 @@ def find_run(plan: CampaignPlan, run_id: str | None = None) -> Path:
     if run_id is not None:
         directory = parent / run_id
         if not has_begun(directory / JOURNAL_NAME):
-            known = sorted(p.parent.name for p in parent.glob(f"*/{JOURNAL_NAME}"))
-            raise JournalError(f"{directory}: no such run; known: {', '.join(known) or 'none'}")
+            names = sorted(p.parent.name for p in parent.glob(f"*/{JOURNAL_NAME}"))
+            raise JournalError(f"{directory}: no such run; known: {', '.join(names) or 'none'}")
     else:
         directory = _newest_unfinished(plan, parent)
     check_journal(directory / JOURNAL_NAME).require()

@@ -168,8 +168,8 @@ def dispense_stages(
             raise RunError(f"the content of the sources is not known: {error}; write 'start: filled'") from error
 
     def doses(results: Results, seed: int) -> Strategy:
-        known = result_of(results, SOURCES, SourcesRead).sources
-        return dose_strategy(plan, seed, known, calibrated_sources(plan, calibration, results))
+        contents = result_of(results, SOURCES, SourcesRead).sources
+        return dose_strategy(plan, seed, contents, calibrated_sources(plan, calibration, results))
 
     return [StageDefinition(SOURCES, sources), StageDefinition(DOSES, doses, pours=True)]
 
@@ -271,10 +271,10 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
-            known = with_left_over(with_posterior(deployment, results), results, plan.calibration, scene)
-            known = with_offsets(known, results, _theta(plan, results))
-            known = with_evidence(known, results, plan.calibration, scene, _theta(plan, results))
-            return known.settings.build(known, scene, _theta(plan, results), seed)
+            informed = with_left_over(with_posterior(deployment, results), results, plan.calibration, scene)
+            informed = with_offsets(informed, results, _theta(plan, results))
+            informed = with_evidence(informed, results, plan.calibration, scene, _theta(plan, results))
+            return informed.settings.build(informed, scene, _theta(plan, results), seed)
 
         return build
 
@@ -376,17 +376,17 @@ def with_offsets(deployment: DeploymentPlan, results: Results, best: SimulationP
     nuisances = set(SimulationParameters.nuisances())
     theta = calibrated_theta(results) if CALIBRATION in results else None
     if theta is None and deployment.memory is not None:
-        known = nuisances.intersection(deployment.memory.means)
-        posterior = deployment.memory.thetas(best, POSTERIOR_DRAWS) if known else []
+        offsets = nuisances.intersection(deployment.memory.means)
+        posterior = deployment.memory.thetas(best, POSTERIOR_DRAWS) if offsets else []
     else:
-        known = nuisances.intersection(() if theta is None else theta.searched)
-        if theta is None or theta.posterior is None or not known:
+        offsets = nuisances.intersection(() if theta is None else theta.searched)
+        if theta is None or theta.posterior is None or not offsets:
             return deployment
         rows = theta.posterior.thetas
         posterior = [SimulationParameters.model_validate({**theta.theta.model_dump(), **row}) for row in rows]
     if not posterior:
         return deployment
-    worlds = drawn_worlds(best, POSTERIOR_DRAWS, 0, posterior=posterior, known=known)
+    worlds = drawn_worlds(best, POSTERIOR_DRAWS, 0, posterior=posterior, known=offsets)
     return replace(deployment, bench=tuple(displacement(best, world, deployment.actions) for world in worlds))
 
 

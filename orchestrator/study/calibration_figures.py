@@ -233,11 +233,11 @@ def legend(figure: Figure, strategies: Sequence[str]) -> None:
 
 def draw_calibrations(study: StudyPlan, pooled: Gathered) -> list[Drawn]:
     """Draw all figures for which there is data."""
-    known = {name: scores for name, scores in pooled.calibrated.items() if any(scores.test)}
-    strategies = {name: scores for name, scores in known.items() if name not in (UNCALIBRATED, RANDOM)}
-    figures = [_boxes(known)] if known else []
+    tested = {name: scores for name, scores in pooled.calibrated.items() if any(scores.test)}
+    strategies = {name: scores for name, scores in tested.items() if name not in (UNCALIBRATED, RANDOM)}
+    figures = [_boxes(tested)] if tested else []
     if strategies:
-        figures.append(_against_simulations(strategies, known.get(UNCALIBRATED)))
+        figures.append(_against_simulations(strategies, tested.get(UNCALIBRATED)))
         figures.append(_over_theta(study, strategies))
     return figures
 
@@ -247,10 +247,10 @@ def error(estimate: Estimate) -> list[list[float]]:
     return [[np.nan_to_num(estimate.mean - estimate.low)], [np.nan_to_num(estimate.high - estimate.mean)]]
 
 
-def _boxes(known: Mapping[str, StrategyScores]) -> Drawn:
-    figure, axes = style.new_figure(size=(1.6 + 1.25 * len(known), 4.2))
+def _boxes(tested: Mapping[str, StrategyScores]) -> Drawn:
+    figure, axes = style.new_figure(size=(1.6 + 1.25 * len(tested), 4.2))
     rows: list[list[object]] = []
-    for place, (name, scores) in enumerate(known.items(), start=1):
+    for place, (name, scores) in enumerate(tested.items(), start=1):
         pooled = [100 * value for test in scores.test for value in test]
         axes.boxplot([pooled], positions=[place], widths=0.55, showfliers=False, medianprops={"color": style.INK})
         axes.plot(np.linspace(place - 0.12, place + 0.12, len(pooled)), pooled, ".", color=style.PALE, zorder=1)
@@ -258,7 +258,7 @@ def _boxes(known: Mapping[str, StrategyScores]) -> Drawn:
         axes.errorbar([place], [average.mean], yerr=error(average), fmt="D", color=colour(name), capsize=4, zorder=4)
         quartiles = [float(q) for q in np.percentile(pooled, [25, 50, 75])]
         rows.append([name, average.count, len(pooled), average.mean, average.low, average.high, *quartiles])
-    axes.set_xticks(range(1, len(known) + 1), list(known))
+    axes.set_xticks(range(1, len(tested) + 1), list(tested))
     axes.set_ylim(bottom=0.0)
     style.dress(axes, title="Test discrepancy", y="|measured − simulated| spillage [%]")
     return Drawn(
@@ -273,10 +273,10 @@ def _boxes(known: Mapping[str, StrategyScores]) -> Drawn:
     )
 
 
-def _against_simulations(known: Mapping[str, StrategyScores], uncalibrated: StrategyScores | None) -> Drawn:
+def _against_simulations(strategies: Mapping[str, StrategyScores], uncalibrated: StrategyScores | None) -> Drawn:
     figure, axes = style.new_figure(size=(6.4, 4.2))
     rows: list[list[object]] = []
-    for name, scores in known.items():
+    for name, scores in strategies.items():
         curves = [_curve(name, *pair) for pair in zip(scores.results, scores.expected, strict=True)]
         curves = [curve for curve in curves if curve]
         if not curves:
@@ -299,7 +299,7 @@ def _against_simulations(known: Mapping[str, StrategyScores], uncalibrated: Stra
                 clip_on=False,
             )
         else:
-            axes.plot(spent, means, series_style(name, list(known)).line, color=colour(name), label=name)
+            axes.plot(spent, means, series_style(name, list(strategies)).line, color=colour(name), label=name)
             axes.errorbar(
                 spent[-1:], means[-1:], yerr=error(points[-1][1]), fmt="o", color=colour(name), capsize=4, clip_on=False
             )
@@ -309,7 +309,7 @@ def _against_simulations(known: Mapping[str, StrategyScores], uncalibrated: Stra
         axes.axhline(e.mean, color=colour(UNCALIBRATED), linestyle="--", label=UNCALIBRATED, zorder=1)
     log_axis(axes.xaxis)
     axes.set_ylim(bottom=0.0)
-    legend(figure, list(known))
+    legend(figure, list(strategies))
     style.dress(axes, title="Discrepancy against simulations", x="simulations", y="best discrepancy [%]", grid="both")
     return Drawn(
         "figure-3c",
@@ -341,14 +341,14 @@ def _displayed(places: Iterable[tuple[float, float]], factors: Sequence[float]) 
     return [[place[k] / factors[k] for place in places] for k in (0, 1)]
 
 
-def _over_theta(study: StudyPlan, known: Mapping[str, StrategyScores]) -> Drawn:
-    figure, grid = style.new_figure(1, len(known), size=(1.0 + 3.4 * len(known), 3.9), squeeze=False)
+def _over_theta(study: StudyPlan, strategies: Mapping[str, StrategyScores]) -> Drawn:
+    figure, grid = style.new_figure(1, len(strategies), size=(1.0 + 3.4 * len(strategies), 3.9), squeeze=False)
     rows: list[list[object]] = []
     names: list[str] = []
     box = {axis.name: axis for axis in study.calibrations[0].plan.parameters.axes}
     shown = None
-    top = 100 * max((_largest(scores) for scores in known.values()), default=1.0)
-    for axes, (name, scores) in zip(grid[0], known.items(), strict=True):
+    top = 100 * max((_largest(scores) for scores in strategies.values()), default=1.0)
+    for axes, (name, scores) in zip(grid[0], strategies.items(), strict=True):
         thetas = [result.found for result in scores.results if result.found is not None]
         maps = [theta.map for theta in thetas if theta.map is not None]
         names = list(maps[0].over) if maps else [*thetas[0].searched, *thetas[0].searched][:2]

@@ -131,9 +131,9 @@ def _run(plan: StudyPlan, folder: Path, workers: LocalCells, path: Path) -> Cell
             task = bar.add_task("cells", left="")
 
             def watch(status: CellStatus) -> None:
-                known = len(status.finished) + len(status.failed) + len(status.skipped)
+                ended = len(status.finished) + len(status.failed) + len(status.skipped)
                 text = f"about {_duration(status.seconds_left(workers.slots))} left" if status.running else ""
-                bar.update(task, total=status.cells, completed=known, left=text)
+                bar.update(task, total=status.cells, completed=ended, left=text)
 
             return run_cells(plan, folder, workers, watch=watch)
     except KeyboardInterrupt:

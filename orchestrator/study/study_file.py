@@ -383,7 +383,7 @@ def _with_parameters(base: CampaignPlan, changes: ParametersBase, place: Place, 
     if not axes:
         report.add(place, "fixes all that the campaign searches; leave a range to at least one")
         return base
-    known = {**base.calibration.fixed_parameters, **fixed}
+    values = {**base.calibration.fixed_parameters, **fixed}
     calibration = replace(
         base.calibration,
         parameters=Space(tuple(axes.values())),
@@ -391,7 +391,7 @@ def _with_parameters(base: CampaignPlan, changes: ParametersBase, place: Place, 
             *(prior for prior in base.calibration.parameter_prior if prior.name not in (*fixed, *searched)),
             *changes.priors(),
         ),
-        fixed_parameters={name: value for name, value in known.items() if name not in axes},
+        fixed_parameters={name: value for name, value in values.items() if name not in axes},
     )
     return replace(base, calibration=calibration)
 
@@ -408,12 +408,12 @@ def _searched(file: StudyFile, base: CampaignPlan, root: Place, report: Report) 
             )
         elif name in file.search[:i]:
             report.add(root.at("search", i), f"'{name}' stands twice; keep one")
-    known = list(dict.fromkeys(name for name in file.search if name in axes))
-    if not known:
+    names = list(dict.fromkeys(name for name in file.search if name in axes))
+    if not names:
         if not file.search:
             report.add(root.at("search"), "is empty; name parameters, or remove the key")
         return base.calibration.parameters
-    return Space(tuple(axes[name] for name in known))
+    return Space(tuple(axes[name] for name in names))
 
 
 HARDWARE = (
@@ -511,8 +511,8 @@ def _compared_calibrations(
         settled = settings.settled(base.parameters.names, train, PlacedProblems(at, report))
         if settled is None:
             continue
-        prior, known = (base.prior, base.parameter_prior) if kind.has_prior else ((), ())
-        plan = replace(base, settings=settled, prior=prior, parameter_prior=known)
+        prior, parameter_prior = (base.prior, base.parameter_prior) if kind.has_prior else ((), ())
+        plan = replace(base, settings=settled, prior=prior, parameter_prior=parameter_prior)
         count = getattr(strategy, "pours", 0)  # only a strategy that chooses its pours has the key
         if count:
             plan = replace(plan, design="active", design_simulations=strategy.design_simulations)

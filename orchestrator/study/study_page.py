@@ -225,8 +225,8 @@ def _deployment_effects(study: StudyPlan, pooled: Gathered) -> Iterator[TableRow
             filter(d1_iterations, losses.strategies), key=lambda strategy: d1_iterations(strategy) or 0, default=""
         )
         named = {"D1": longest}
-        known = [(named.get(first, first), named.get(second, second)) for first, second in pairs]
-        known += [
+        pairs_shown = [(named.get(first, first), named.get(second, second)) for first, second in pairs]
+        pairs_shown += [
             (strategy, rival) for strategy in losses.strategies if not is_ours(strategy) for rival in ("D3", "D2")
         ]
         shown: list[tuple[str, Callable[[str, Sequence[str], str], Mapping[int, float]]]] = [
@@ -239,7 +239,7 @@ def _deployment_effects(study: StudyPlan, pooled: Gathered) -> Iterator[TableRow
         if len(groups) > 1:
             groups[ALL] = losses.receivers
         for (first, second), level, (of, values), (name, group) in itertools.product(
-            known, losses.levels, shown, groups.items()
+            pairs_shown, losses.levels, shown, groups.items()
         ):
             if first in losses.strategies and second in losses.strategies:
                 gain = effect(values(level, group, first), values(level, group, second), losses.range)

@@ -231,9 +231,9 @@ def cells_of(study: StudyPlan) -> tuple[StudyCell, ...]:
                 if study.compares(level.name):
                     add("uncalibrated", study.pour_count, 0, pours, **place)
             for compared in calibrations:
-                known = compared.plan.strategy == "C1"
-                spent = 0 if known else compared.plan.settings.simulations_on(train)
-                made_of = (pours, GRID) if known else (pours,)
+                by_grid = compared.plan.strategy == "C1"
+                spent = 0 if by_grid else compared.plan.settings.simulations_on(train)
+                made_of = (pours, GRID) if by_grid else (pours,)
                 if compared.pours:
                     made_of = (
                         pours,

@@ -189,8 +189,8 @@ def running_least(values: Sequence[float]) -> list[float]:
 
 def mean(values: Sequence[float]) -> float:
     """Mean without NaN; NaN if there is no number."""
-    known = [value for value in values if not math.isnan(value)]
-    return sum(known) / len(known) if known else math.nan
+    defined = [value for value in values if not math.isnan(value)]
+    return sum(defined) / len(defined) if defined else math.nan
 
 
 def at_pour(curves: Sequence[Sequence[float]], pour: int) -> list[float]:
@@ -247,14 +247,14 @@ def estimate(values: Sequence[float], within: Range = ANYTHING) -> Estimate:
     """
     from scipy.special import stdtrit
 
-    known = np.array([value for value in values if not math.isnan(value)], dtype=np.float64)
-    count = len(known)
+    defined = np.array([value for value in values if not math.isnan(value)], dtype=np.float64)
+    count = len(defined)
     if count == 0:
         return Estimate(math.nan, math.nan, math.nan, 0)
-    mean = float(known.mean())
+    mean = float(defined.mean())
     if count < 2:
         return Estimate(mean, math.nan, math.nan, count)
-    half = float(stdtrit(count - 1, (1 + COVERED) / 2) * known.std(ddof=1) / math.sqrt(count))
+    half = float(stdtrit(count - 1, (1 + COVERED) / 2) * defined.std(ddof=1) / math.sqrt(count))
     least, largest = min(within[0], mean), max(within[1], mean)
     return Estimate(mean, max(mean - half, least), min(mean + half, largest), count)
 
@@ -299,8 +299,8 @@ def effect(first: Mapping[int, float], second: Mapping[int, float], within: Rang
     Source: Fisher's randomisation test of paired differences (The Design of Experiments, 1935, section 21).
     """
     both = [first[n] - second[n] for n in sorted(first.keys() & second.keys())]
-    known = [difference for difference in both if not math.isnan(difference)]
-    return Effect(estimate(known, difference_of(within)), sum(d < 0.0 for d in known), _chance(known))
+    defined = [difference for difference in both if not math.isnan(difference)]
+    return Effect(estimate(defined, difference_of(within)), sum(d < 0.0 for d in defined), _chance(defined))
 
 
 def _chance(differences: Sequence[float]) -> float | None:

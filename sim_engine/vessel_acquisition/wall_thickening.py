@@ -109,7 +109,7 @@ def _inner_faces(vertices: Floats, faces: Integers, normal: Floats, cavity: Exac
     wet = cavity.pool[tuple(chosen.T)]
     square, index, foot = igl.point_mesh_squared_distance(nodes, vertices, faces)
     near = np.asarray(square) < (NEAR * layout.spacing) ** 2
-    known = np.hstack([np.asarray(foot)[near], NORMAL * normal[np.asarray(index)[near]]])
+    features = np.hstack([np.asarray(foot)[near], NORMAL * normal[np.asarray(index)[near]]])
     sought = np.hstack([vertices[faces].mean(axis=1), NORMAL * normal])
-    _, nearest = cKDTree(known).query(sought)
+    _, nearest = cKDTree(features).query(sought)
     return np.asarray(wet[near][nearest], dtype=bool)

@@ -99,8 +99,8 @@ def nearest_to_receiver(sampled: SampledPath, until: float, pourer: Vessel, rece
     # between two poses that differ by a displacement w, no point comes nearer than the nearer pose's distance − w/2
     least = np.minimum(away[:-1], away[1:]) - 0.5 * np.diff(way[coarse])
     # beyond the range of a vessel's grid only a lower bound of the distance is known
-    known = least - np.maximum(np.minimum(away[:-1], away[1:]) - MARGIN, 0.0)
-    doubtful = (known < sampled.spec.limits.clearance) | (least < float(away.min()))
+    lower_bounds = least - np.maximum(np.minimum(away[:-1], away[1:]) - MARGIN, 0.0)
+    doubtful = (lower_bounds < sampled.spec.limits.clearance) | (least < float(away.min()))
     dense = thinned(way, FINE)
     gap = np.clip(np.searchsorted(coarse, dense, side="right") - 1, 0, len(doubtful) - 1)
     fine = dense[doubtful[gap]]

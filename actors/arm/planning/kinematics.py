@@ -102,13 +102,13 @@ def refined(q: FloatArray, rotation: FloatArray, position: FloatArray, m: RobotM
     """
     if m.calibration is None:
         return q
-    q, known = q.copy(), np.isfinite(q).all(axis=-1)
+    q, solved = q.copy(), np.isfinite(q).all(axis=-1)
     for step in range(NEWTON_STEPS + 1):
-        axes, points, flange, place = _chain(q[known], m.calibration)
-        apart = rotation[known] @ np.swapaxes(flange, -1, -2)
+        axes, points, flange, place = _chain(q[solved], m.calibration)
+        apart = rotation[solved] @ np.swapaxes(flange, -1, -2)
         turn = 0.5 * np.stack([apart[:, 2, 1] - apart[:, 1, 2], apart[:, 0, 2] - apart[:, 2, 0],
                                apart[:, 1, 0] - apart[:, 0, 1]], axis=-1)  # fmt: skip
-        error = np.concatenate([position[known] - place, turn], axis=-1)
+        error = np.concatenate([position[solved] - place, turn], axis=-1)
         if step == NEWTON_STEPS or not np.any(np.abs(error) > 1e-11):
             break
         columns = [
@@ -119,8 +119,8 @@ def refined(q: FloatArray, rotation: FloatArray, position: FloatArray, m: RobotM
         transposed = np.swapaxes(jacobian, -1, -2)
         # slightly damped, so that a singular pose is no error here: its joints do not converge, and are NaN below
         change = np.linalg.solve(transposed @ jacobian + 1e-14 * np.eye(6), transposed @ error[..., None])
-        q[known] += change[..., 0]
-    q[known] = np.where(np.abs(error).max(axis=-1, keepdims=True) < 1e-8, q[known], np.nan)
+        q[solved] += change[..., 0]
+    q[solved] = np.where(np.abs(error).max(axis=-1, keepdims=True) < 1e-8, q[solved], np.nan)
     return q
 
 

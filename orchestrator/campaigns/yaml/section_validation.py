@@ -146,14 +146,14 @@ def _cut(data: Any, loc: Loc) -> bool:
 
 def _loc_in(data: Any, loc: Loc) -> Loc:
     """The location without union tags and filled-in keys, which the file does not have."""
-    known: list[str | int] = []
+    path: list[str | int] = []
     for key in loc:
         in_mapping = isinstance(data, dict) and key in data
         in_list = isinstance(data, list) and isinstance(key, int) and key < len(data)
         if in_mapping or in_list:
             data = data[key]
-            known.append(key)
-    return tuple(known)
+            path.append(key)
+    return tuple(path)
 
 
 def _cut_empty(data: Any, place: Place, report: Report) -> None:
@@ -266,8 +266,8 @@ def _unknown_key(model: type[Settings], loc: Loc, data: Any) -> str:
         return f"unknown key here; fix it under 'motion: {{{key}: {EXAMPLES[key]}}}' or search it under 'actions'"
     if key in EXAMPLES:
         return f"unknown key here; it belongs under 'simulator: {{parameters: {{{key}: {EXAMPLES[key]}}}}}'"
-    known = _keys(_variant(_sections_at(model, loc[:-1], data), _node(data, loc[:-1])))
-    return f"unknown key; known here: {', '.join(sorted(known))}"
+    keys = _keys(_variant(_sections_at(model, loc[:-1], data), _node(data, loc[:-1])))
+    return f"unknown key; known here: {', '.join(sorted(keys))}"
 
 
 def _keys(sections: set[type[Settings]]) -> set[str]:

@@ -338,10 +338,10 @@ def create_node(daemon: Supervisor, ordering: Ordering, settings: MadsciSettings
     async def only_allowed(request: Request, call_next: Any) -> Any:
         address = "" if request.client is None else request.client.host
         try:
-            known = any(ipaddress.ip_address(address) in network for network in allowed)
+            permitted = any(ipaddress.ip_address(address) in network for network in allowed)
         except ValueError:
-            known = False
-        if not known:
+            permitted = False
+        if not permitted:
             return await refused(request, HTTPException(403, f"{address} is not in the node's list (madsci: allow)"))
         return await call_next(request)
 

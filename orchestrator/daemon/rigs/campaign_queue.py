@@ -155,7 +155,7 @@ class CampaignQueue:
         """Return a campaign by its id, its caller's id or a unique prefix of three letters or more. Raises KeyError."""
         entry = self._store.item(key) or self._store.by_caller_id(key)
         if entry is None and len(key) >= 3:
-            similar = [known for known in self._store.items() if known.id.startswith(key)]
+            similar = [queued for queued in self._store.items() if queued.id.startswith(key)]
             entry = similar[0] if len(similar) == 1 else None
         if entry is None:
             raise KeyError(key)

@@ -261,8 +261,8 @@ class Materials:
     def _row(self, table: str, key: str) -> dict[str, Any]:
         rows = self._store.rows(f"select * from {table} where id = ? or code = ?", key, key)
         if not rows:
-            known = [row["id"] for row in self._store.rows(f"select id from {table} order by created desc limit 20")]
-            raise MaterialError(f"there is no {table} '{key[:80]}'; there are {', '.join(known) or 'none'}")
+            ids = [row["id"] for row in self._store.rows(f"select id from {table} order by created desc limit 20")]
+            raise MaterialError(f"there is no {table} '{key[:80]}'; there are {', '.join(ids) or 'none'}")
         return rows[0]
 
     def everything(self, running: Collection[str] = ()) -> dict[str, list[dict[str, Any]]]:

@@ -119,8 +119,8 @@ class Ordering:
 
     async def _place(self, request: PourIn, body: dict[str, Any], by: str) -> dict[str, Any]:
         """Place an order if its id has none; return the request that the id belongs to."""
-        if (known := self.book.find(request.id)) is not None:
-            return dict(known["body"])
+        if (earlier := self.book.find(request.id)) is not None:
+            return dict(earlier["body"])
         item, order, predicted = await self._prepared(request, by)
 
         def enter() -> None:

@@ -207,13 +207,13 @@ def carried_cup(order: PourOrder, laboratory: LaboratorySettings | None) -> str:
     """
     if laboratory is None or not laboratory.places or order.amount is None or not (order.stand or order.position):
         return ""
-    known = [place.name for place in all_places(laboratory.places)]
+    places = [place.name for place in all_places(laboratory.places)]
     for vessel, position in ((order.source, order.stand), (order.receiver, order.position)):
-        if position not in known or (vessel == order.receiver and "/" not in position):
+        if position not in places or (vessel == order.receiver and "/" not in position):
             stands = f"at '{position}'" if position else "nowhere"
             raise OrderError(
                 f"{vessel}: stands {stands}, and the arm of laboratory '{laboratory.name}' pours from a source with a "
-                f"place into a cup in a rack; its places are {', '.join(known)}"
+                f"place into a cup in a rack; its places are {', '.join(places)}"
             )
     return f"{laboratory.name}/{order.position}"
 

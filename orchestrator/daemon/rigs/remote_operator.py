@@ -199,8 +199,8 @@ class RunQuestions:
         before = [q for q in self._store.questions(only_open=False, campaign=self._campaign) if q.text == question]
         if before and before[0].answer and not problem:
             details["answered before"] = f"'{before[0].answer}' by {before[0].by}; check whether it was used"
-        found = await asyncio.to_thread(self._look)
-        details[DIAGNOSTICS] = "\n".join(f"{name}: {text}" for name, text in found.items())
+        diagnostics = await asyncio.to_thread(self._look)
+        details[DIAGNOSTICS] = "\n".join(f"{name}: {text}" for name, text in diagnostics.items())
         return await self._asking.ask(
             **asked, kind="unknown", about="unknown pour", options=list(options), details=details, hands=False
         )

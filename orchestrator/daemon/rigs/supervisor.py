@@ -56,8 +56,8 @@ class Supervisor:
     async def start(self) -> None:
         """Recover the stored state and start all tasks."""
         shared = self.shared
-        known = {row["id"] for row in shared.store.rows("select id from campaign")}
-        await asyncio.to_thread(self._remove_unacknowledged, known)
+        acknowledged = {row["id"] for row in shared.store.rows("select id from campaign")}
+        await asyncio.to_thread(self._remove_unacknowledged, acknowledged)
         for item in shared.store.active():
             reason = f"found {item.state} after the daemon had ended without a word"
             # without a run nothing has begun: it is in the queue again
@@ -79,10 +79,10 @@ class Supervisor:
             self._tasks.append(asyncio.create_task(self._warm_up(), name="simulators"))
         shared.feed.publish("DaemonStarted", {"rigs": [rig.name for rig in shared.settings.rigs]})
 
-    def _remove_unacknowledged(self, known: set[str]) -> None:
+    def _remove_unacknowledged(self, acknowledged: set[str]) -> None:
         """Delete snapshots of submissions that were not yet acknowledged when the daemon died."""
         for folder in self.shared.settings.snapshots.iterdir():
-            if folder.name not in known:
+            if folder.name not in acknowledged:
                 shutil.rmtree(folder, ignore_errors=True)
 
     async def _watch_charts(self) -> None:

@@ -73,9 +73,9 @@ class Pours:
         """
         with self._guard:
             before = self._read.pop(directory, None)
-            planned, known = (plan(), None) if before is None else before
+            planned, earlier = (plan(), None) if before is None else before
             try:
-                record = read_record(directory, known=known)
+                record = read_record(directory, earlier=earlier)
             except (JournalError, CodecError, OSError):
                 return {}  # being created, or of another version: read from its start at the next call
             self._read[directory] = planned, record

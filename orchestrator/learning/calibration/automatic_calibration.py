@@ -217,10 +217,10 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
         super().tell(request, outcome)
         if not isinstance(request, Simulate):
             return
-        known = [self._merit(trial, score) for trial in self._compared() if (score := self._score(trial)) is not None]
-        for trial in self._trials.all[self._starts :] if known else ():
+        merits = [self._merit(trial, score) for trial in self._compared() if (score := self._score(trial)) is not None]
+        for trial in self._trials.all[self._starts :] if merits else ():
             least = sum(discrepancies(trial)) / len(self._usable)
-            if not trial.closed and self._merit(trial, least) > min(known):
+            if not trial.closed and self._merit(trial, least) > min(merits):
                 self._trials.abandon(trial)
 
     def _merit(self, trial: Trial, score: float) -> float:

@@ -180,13 +180,13 @@ class Evaluation:
                 'posterior 2' … are draws; the mean of their simulations is scored as well.
             train_seeds: seeds on the usable training pours; empty: new ones.
         """
-        seeds, known = SeedStream(seed, "evaluation"), iter(train_seeds)
+        seeds, training_seeds = SeedStream(seed, "evaluation"), iter(train_seeds)
         self._cases: list[_Case] = []
         self._thetas = dict(thetas)
         for scored in pours:
             if scored.pour.spillage is None:
                 continue
-            seed_of_pour = next(known) if train_seeds and scored.pour.split == "train" else seeds.next()
+            seed_of_pour = next(training_seeds) if train_seeds and scored.pour.split == "train" else seeds.next()
             for label, theta in thetas.items():
                 request = Simulate(scored.scene, scored.pour.action, theta, seed_of_pour, "evaluate")
                 self._cases.append(_Case(label, scored, request))
@@ -247,8 +247,8 @@ class Evaluation:
     def random_median(self, split: str) -> float | None:
         """Median of the mean discrepancies of the θ with labels 'random …' in a split."""
         scores = [self.discrepancy(label, split) for label in self._thetas if label.startswith("random ")]
-        known = [score for score in scores if score is not None]
-        return median(known) if known else None
+        defined = [score for score in scores if score is not None]
+        return median(defined) if defined else None
 
     def posterior_mean(self, split: str) -> float | None:
         """Mean |r − c̄_s| over a split's pours; c̄_s averages all θ labelled 'posterior …'. None if nothing is
@@ -300,10 +300,10 @@ def random_parameters(
 
 def mean_predictor_discrepancy(train: Sequence[MeasuredPour], test: Sequence[MeasuredPour]) -> float | None:
     """Mean |r − r̄| over the test pours, where r̄ is the mean of the training pours; None if either set is empty."""
-    known, wanted = _spillages(train), _spillages(test)
-    if not known or not wanted:
+    trained, wanted = _spillages(train), _spillages(test)
+    if not trained or not wanted:
         return None
-    mean = sum(known) / len(known)
+    mean = sum(trained) / len(trained)
     return sum(abs(r - mean) for r in wanted) / len(wanted)
 
 
@@ -385,11 +385,11 @@ def calibration_gain(calibrated: Sequence[ScoredPair], uncalibrated: Sequence[Sc
     error = stdev(gains) / math.sqrt(len(gains)) if len(gains) > 1 else None
     fitted, plain = (fmean(values) if both else None for values in (zip(*both, strict=True) if both else ((), ())))
     count, least = len(calibrated), LEAST_DEFINED * len(calibrated)
-    known = [sum(pair.simulated is not None for pair in pairs) for pairs in (calibrated, uncalibrated)]
-    if min(known) < least <= max(known):
-        justified = known[0] >= least
+    counts = [sum(pair.simulated is not None for pair in pairs) for pairs in (calibrated, uncalibrated)]
+    if min(counts) < least <= max(counts):
+        justified = counts[0] >= least
         name = "the uncalibrated parameters" if justified else "θ*"
-        why = f"with {name} only {min(known)} of {count} pours have a simulated spillage"
+        why = f"with {name} only {min(counts)} of {count} pours have a simulated spillage"
     elif fitted is None or plain is None or gain is None or error is None:
         justified, why = False, "fewer than two pours could be compared"
     else:
@@ -519,8 +519,8 @@ class CalibrationEvaluation:
         decisions = [decision for scorer in self._parts for decision in scorer.decisions]
         if self._gain is not None:
             numbers = {"gain": self._gain.gain, "gain_error": self._gain.gain_error}
-            known = {name: value for name, value in numbers.items() if value is not None}
-            decisions.append(Decision(self._gain.text, known))
+            defined = {name: value for name, value in numbers.items() if value is not None}
+            decisions.append(Decision(self._gain.text, defined))
         return decisions
 
     def ask(self, slots: Slots) -> list[Request]:

@@ -167,8 +167,8 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
         contexts = self._contexts
         sequence = contexts.sequence(self._plan, 2 * self._settings.budget, self._seeds.next())
         scenes = {scene.name: scene for scene in self._plan.scenes}
-        known = tuple(contexts.place(scenes[pair.scene], pair.action) for pair in self._plan.known)
-        everywhere = (*sequence, *known)
+        places = tuple(contexts.place(scenes[pair.scene], pair.action) for pair in self._plan.known)
+        everywhere = (*sequence, *places)
         spillage, poured = Data(), Data()
         for pour in self._train:
             point = contexts.point(pour)
@@ -193,7 +193,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             self._actions = tuple(sequence[i] for i in order)
             self._measured_at = tuple(min(max(regression.predictions[i], 0.0), 1.0) for i in order)
             expected = regression.predictions[len(sequence) :]
-            for simulation, place, measured in zip(self._plan.known, known, expected, strict=True):
+            for simulation, place, measured in zip(self._plan.known, places, expected, strict=True):
                 theta = tuple(map(float, self._plan.parameters.encode(simulation.theta)))
                 self._before = self._before.added((*theta, *place), min(max(measured, 0.0), 1.0) - simulation.spillage)
             self.decisions.append(

@@ -97,16 +97,20 @@ class DiscrepancyOverPours(Calibration[S]):
         neighbourhood."""
         trials = self._trials.counting(everything=everything)
         scores = [(trial.point, self._score(trial)) for trial in trials]
-        known = [score for _, score in scores if score is not None]
-        if not known:
+        defined = [score for _, score in scores if score is not None]
+        if not defined:
             return Data()
-        costs = tuple(max(known) if score is None else score for _, score in scores)
+        costs = tuple(max(defined) if score is None else score for _, score in scores)
         return Data(tuple(point for point, _ in scores), costs)
 
     def _score(self, trial: Trial) -> float | None:
         """O1 of a θ; None if it is defined on too few pours."""
-        known = discrepancies(trial)
-        return sum(known) / len(known) if known and len(known) >= LEAST_DEFINED * len(self._usable) else None
+        differences = discrepancies(trial)
+        return (
+            sum(differences) / len(differences)
+            if differences and len(differences) >= LEAST_DEFINED * len(self._usable)
+            else None
+        )
 
     def _settle_at_lowest(self) -> None:
         """Set θ* to the simulated θ with the lowest O1, with the standard error of this mean over the pours."""
@@ -114,9 +118,9 @@ class DiscrepancyOverPours(Calibration[S]):
         if not scored:
             raise self._no_discrepancies()
         mean, best = min(scored, key=lambda pair: self._merit(pair[1], pair[0]))
-        known = discrepancies(best)
-        variance = sum((cost - mean) ** 2 for cost in known) / max(len(known) - 1, 1)
-        self._settle(best.point, mean, math.sqrt(variance / len(known)))
+        differences = discrepancies(best)
+        variance = sum((cost - mean) ** 2 for cost in differences) / max(len(differences) - 1, 1)
+        self._settle(best.point, mean, math.sqrt(variance / len(differences)))
 
     def _merit(self, trial: Trial, score: float) -> float:
         """The quantity that θ* minimises over the trials."""
@@ -130,14 +134,14 @@ class DiscrepancyOverPours(Calibration[S]):
         self._final = suggestion
 
     def _row(self, number: int, trial: Trial) -> TriedOnPours:
-        known = discrepancies(trial)
+        differences = discrepancies(trial)
         costs = {trial.requests[i].seed: cost for i, cost in trial.costs.items()}
         by_pour = [costs.get(seed) for seed in self._seed_of_pour]
         return TriedOnPours(
             theta=self._values(trial.point),
             discrepancy=self._score(trial),
-            defined=len(known),
-            largest=max(known, default=None),
+            defined=len(differences),
+            largest=max(differences, default=None),
             differences=tuple(None if cost is None else abs(cost) for cost in by_pour),
         )
 

@@ -112,12 +112,12 @@ def posterior_found(posterior: Posterior, space: Space) -> PosteriorFound:
 
 def unit_prior(plan: CalibrationPlan) -> tuple[tuple[float, float], ...]:
     """Prior knowledge of the searched θ in the form of a `PosteriorQuestion`: mean and deviation per axis."""
-    known = {prior.name: prior for prior in plan.parameter_prior}
-    if not known:
+    priors = {prior.name: prior for prior in plan.parameter_prior}
+    if not priors:
         return ()
     rows = []
     for axis in plan.parameters.axes:
-        prior = known.get(axis.name)
+        prior = priors.get(axis.name)
         alike = (0.5, 0.0)
         rows.append(alike if prior is None else (axis.encode(prior.mean), prior.deviation / (axis.upper - axis.lower)))
     return tuple(rows)

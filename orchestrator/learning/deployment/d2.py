@@ -44,10 +44,10 @@ class RealOnly(Deployment[D2Settings]):
         ledger = self._ledger
         if ledger.pours_left:
             points = [p.point for p in ledger.pours if p.status != "refused"]
-            known = [*(point for point, _ in ledger.known), *points]
-            if len(known) < min(self._settings.initial_samples, self._plan.pours):
+            tried = [*(point for point, _ in ledger.known), *points]
+            if len(tried) < min(self._settings.initial_samples, self._plan.pours):
                 # one Sobol sequence, point by point, each far from the points already poured
-                query = self._requests.space_filling(known=tuple(known))
+                query = self._requests.space_filling(known=tuple(tried))
                 self._questions.put(query, "start", lambda suggestion: self._pour(suggestion.points[0]))
             else:
                 self._questions.put(self._about(MinimumQuery), "pour", self._pour_first)

@@ -184,17 +184,17 @@ class Hybrid(Deployment[D3Settings]):
             self._questions.put(self._requests.space_filling(count=count), "start", simulate)
         elif self._trials.ready:
             # in the paper κ is constant, and no simulation only fills space
-            known, pending, plain = self._ledger.simulated(), self._trials.pending(), not settings.adaptive
+            simulated, pending, plain = self._ledger.simulated(), self._trials.pending(), not settings.adaptive
             left = self._before - self._ledger.spent
             aimed = choice.acquisition == "least_loss" and left <= settings.prior_simulations // AIMED
-            if aimed and found_good(known.costs):
+            if aimed and found_good(simulated.costs):
                 # those for the first pour: where it may be made, and where it tells the hypotheses apart
                 real, count = self._ledger.real(), 1 + min(left, TOGETHER)
-                about = choice.about(real, known, count=count, acquisition="least_loss", pending=pending)
+                about = choice.about(real, simulated, count=count, acquisition="least_loss", pending=pending)
                 self._questions.put(about, "prior", lambda answer: self._simulate(answer, "prior", first=1))
                 return
             parts = {"pending": pending, "plain": plain, "replicates": plain}
-            query = self._requests.query(MinimumQuery, known, everything=False, **parts)
+            query = self._requests.query(MinimumQuery, simulated, everything=False, **parts)
             self._questions.put(query, "prior", simulate)
 
     def _next_pour(self) -> None:

@@ -211,16 +211,16 @@ class Deployment(ABC, Generic[S]):
         """Queue a pour of the first suggested point, with the surrogate's prediction if there is one."""
         if suggestion.surrogate is not None:
             self._report.latest_map = suggestion
-        known, worst = None, self._ledger.costing.worst
+        prediction, worst = None, self._ledger.costing.worst
         if suggestion.means:
             scatter = observed_scatter(suggestion, suggestion.noises[0] if suggestion.noises else None)
             band = suggestion.bands[0] if suggestion.bands else None
-            known = Prediction(suggestion.means[0], suggestion.deviations[0], scatter, band)
+            prediction = Prediction(suggestion.means[0], suggestion.deviations[0], scatter, band)
             if band is not None and suggestion.discrepancy is not None:
-                known = replace(known, band=scaled_interval(known, self._ledger.pours, worst))
+                prediction = replace(prediction, band=scaled_interval(prediction, self._ledger.pours, worst))
             elif band is not None:  # averaged over hyperparameters; the largest loss is unknown there
-                known = replace(known, band=(min(band[0], worst), min(band[1], worst)))
-        self._pour(suggestion.points[0], known)
+                prediction = replace(prediction, band=(min(band[0], worst), min(band[1], worst)))
+        self._pour(suggestion.points[0], prediction)
 
     def _conclude(self, suggestion: Suggestion) -> None:
         self._report.final = suggestion

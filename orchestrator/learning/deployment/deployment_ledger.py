@@ -107,11 +107,11 @@ class DeploymentLedger:
             ValueError: the strategy has no outcome of this request.
         """
         number = request.number if isinstance(request, Pour) else None
-        known = [trial for trial in self.pours if trial.number == number and trial.status in ("weighed", "failed")]
-        if not known:
+        answered = [trial for trial in self.pours if trial.number == number and trial.status in ("weighed", "failed")]
+        if not answered:
             raise ValueError("the strategy has no outcome of this pour")
         self.decisions.append(Decision(f"pour {number} is corrected"))
-        self._settle(known[-1], outcome)
+        self._settle(answered[-1], outcome)
 
     def _settle(self, trial: PourTrial, outcome: Outcome) -> None:
         trial.take(outcome, self.scene, self.costing, penalised=True)

@@ -152,10 +152,10 @@ class SimulatorMonitor:
 
     def record(self, latest: DiscrepancyFound, pours: Sequence[PourTrial]) -> None:
         """Record the conclusions of an answer, and log those of the latest pour."""
-        known = [pour for pour in pours if pour.cost is not None]
-        number = known[-1].number if known else 0
+        weighed = [pour for pour in pours if pour.cost is not None]
+        number = weighed[-1].number if weighed else 0
         self._latest, since = latest, latest.since_change
-        self._changed = known[-since].number if since and since <= len(known) else None
+        self._changed = weighed[-since].number if since and since <= len(weighed) else None
         if self._changed is not None and not self._drifted and self._changed > self._announced + SAME_CHANGE:
             self._announced = self._changed
             text = f"since pour {self._changed} the bench behaves differently: what was poured before no longer counts"

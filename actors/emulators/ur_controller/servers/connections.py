@@ -71,8 +71,8 @@ class Connection(asyncio.Protocol):
     @property
     def privileged(self) -> bool:
         """Whether it may send commands: it was opened in remote control, and the mode was not switched since."""
-        known = self.controller.model.remote_control
-        return not known or (self._privileged and self._switches == self.controller.switches)
+        remote_control = self.controller.model.remote_control
+        return not remote_control or (self._privileged and self._switches == self.controller.switches)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """See `asyncio.Protocol`."""

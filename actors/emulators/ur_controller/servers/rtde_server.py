@@ -98,10 +98,10 @@ class RtdeConnection(Connection):
     def _handle(self, kind: int, payload: bytes) -> None:
         match kind:
             case rtde.REQUEST_PROTOCOL_VERSION:
-                known = len(payload) == 2 and payload[0] == 0 and payload[1] in (1, 2)
-                if known:
+                supported = len(payload) == 2 and payload[0] == 0 and payload[1] in (1, 2)
+                if supported:
                     self._protocol = payload[1]
-                self._send(kind, bytes([known]))
+                self._send(kind, bytes([supported]))
             case rtde.GET_URCONTROL_VERSION:
                 self._send(kind, struct.pack(">4I", *self.controller.model.version))
             case rtde.SETUP_OUTPUTS:

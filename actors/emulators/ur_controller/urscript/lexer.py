@@ -74,7 +74,7 @@ def words(text: str) -> list[ScriptToken]:
     Raises:
         ScriptError: a character that starts no token.
     """
-    found: list[ScriptToken] = []
+    tokens: list[ScriptToken] = []
     line, fresh, place = 1, True, 0
     while place < len(text):
         match = _WORD.match(text, place)
@@ -89,10 +89,10 @@ def words(text: str) -> list[ScriptToken]:
                 kind = "keyword"
             if kind == "string":
                 word = word[1:-1]
-            found.append(ScriptToken(kind, word, line, fresh))
+            tokens.append(ScriptToken(kind, word, line, fresh))
             fresh = False
-    found.append(ScriptToken("end of text", "", line, True))
-    return found
+    tokens.append(ScriptToken("end of text", "", line, True))
+    return tokens
 
 
 _STRUCTURE = re.compile(r"""\#[^\n]*|"[^"\n]*"|'[^'\n]*'|[A-Za-z_][A-Za-z_0-9]*""")
