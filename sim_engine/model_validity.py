@@ -44,18 +44,18 @@ wet its lip rises up to twice that length above it before it leaves; liquid that
 VISCOUS_REYNOLDS = 100.0
 """Reynolds number of the film at the lip below which viscosity matters. A boundary layer of 5√(νl/U) fills the film
 within the length l ≈ 3e in which it accelerates at about Re = 75; above, the time is too short for viscosity to act.
-For liquids as thin as water only; for others viscosity is simulated, …"""
+For liquids as thin as water only; for others viscosity is simulated within the bounds of CREEPING and ADDED."""
 
 CREEPING = 2.0
-"""… up to this viscosity [Pa s], the largest that was compared with theory (`benchmarks.validation film`) …"""
+"""Largest viscosity that was compared with theory [Pa s] (`benchmarks.validation film`)."""
 
 ADDED = 3.0
-"""… and above the kinematic viscosity ADDED · d² [m²/s] that the solver itself adds at a spacing d: vortices of
-10 mm²/s decay as those of 110, 84, 50 and 49 mm²/s at spacings of 6.9, 5.8, 4.6 and 2.9 mm (0.2 m/s;
-`benchmarks.validation.viscous_flows.own_viscosity`) …"""
+"""Viscosity is simulated above the kinematic viscosity ADDED · d² [m²/s] that the solver adds at a spacing d: vortices
+of 10 mm²/s decay as those of 110, 84, 50 and 49 mm²/s at spacings of 6.9, 5.8, 4.6 and 2.9 mm (0.2 m/s;
+`benchmarks.validation.viscous_flows.own_viscosity`)."""
 
 LEAST_ADDED = 40e-6
-"""… and never less than this [m²/s]."""
+"""Least kinematic viscosity that the solver is assumed to add [m²/s]."""
 
 PARTICLES_ACROSS = 2.0
 """Particles across the falling stream: with fewer, no particle has neighbours all around it, and the stream is a

@@ -169,10 +169,10 @@ class PoseErrorSettings(Settings):
     """The receiver stands that much further from the pourer."""
 
     y: Offset = 0.0
-    """… and that much sideways."""
+    """The receiver stands that much further sideways."""
 
     z: Offset = 0.0
-    """… and that much higher."""
+    """The receiver stands that much higher."""
 
     tilt: Tilt = 0.0
     """The pourer is held that much more tilted than commanded."""

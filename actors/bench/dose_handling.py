@@ -344,12 +344,12 @@ class DoseHandling:
         await self._carrier.let_go(consent)
         self._lose_moved()
         vessels, held = self._vessels.values(), {name: self._record.held(name) for name in self._vessels}
-        used = [vessel.name for vessel in vessels if not vessel.liquid and (held[vessel.name] or (0.0,))[0] > 0.0]
-        new = {vessel.name for vessel in vessels if not vessel.liquid and not self._record.unknown(vessel.name)} - {
-            *used
-        }
+        masses = {name: 0.0 if content is None else content[0] for name, content in held.items()}
+        cups = [vessel.name for vessel in vessels if not vessel.liquid]
+        used = [cup for cup in cups if masses[cup] > 0.0]
+        empty = {cup for cup in cups if masses[cup] <= 0.0 and not self._record.unknown(cup)}
         if used:
-            content = ", ".join(f"{name} ({1e3 * (held[name] or (0.0,))[0]:.1f} g)" for name in used)
+            content = ", ".join(f"{name} ({1e3 * masses[name]:.1f} g)" for name in used)
             begins = not self._laid_out and any(vessel.filled for vessel in vessels if vessel.liquid)
             question = OperatorQuestion(
                 f"By the account of vessels these cups hold something: {content}. Are they these, with what they hold? "
@@ -359,16 +359,16 @@ class DoseHandling:
                 details={"begins": float(begins)},
             )
             if (await self._carrier.ask(question, consent)).strip().lower() not in ("yes", "y"):
-                new |= {*used}
+                empty |= {*used}
         fill = {v.name: v.mass for v in vessels if v.liquid and v.filled and not self._laid_out}
         details: dict[str, float | str] = {vessel.name: vessel.place for vessel in vessels}
-        details |= {f"{name} filled_g": 1e3 * mass for name, mass in (fill | dict.fromkeys(new, 0.0)).items()}
-        details |= {f"{name} held_g": 1e3 * content[0] for name, content in held.items() if content is not None}
+        details |= {f"{name} filled_g": 1e3 * mass for name, mass in (fill | dict.fromkeys(empty, 0.0)).items()}
+        details |= {f"{name} held_g": 1e3 * masses[name] for name, content in held.items() if content is not None}
         text = "; ".join(
             [f"'{v.name}' on '{v.place}' with {1e3 * v.mass:.0f} g of {v.liquid}, weighed"
              for v in vessels if v.name in fill]
-            + [f"'{v.name}' on '{v.place}' as it is" for v in vessels if v.name not in new and v.name not in fill]
-            + ([f"empty, dry cups on {', '.join(v.place for v in vessels if v.name in new)}"] if new else [])
+            + [f"'{v.name}' on '{v.place}' as it is" for v in vessels if v.name not in empty and v.name not in fill]
+            + ([f"empty, dry cups on {', '.join(v.place for v in vessels if v.name in empty)}"] if empty else [])
         )  # fmt: skip
         question = OperatorQuestion(
             f"Lay out the vessels: {text}. Leave the gripper, the balance and all other places empty.",
@@ -378,15 +378,16 @@ class DoseHandling:
             details=details,
         )
         await self._carrier.ask(question, consent)
-        for name in new:
+        for name in empty:
             self._empty(name)
         for name, mass in fill.items():
             self._liquids.enter(name, mass, 0.5e-3, self._vessels[name].liquid)
         # a source that an interrupted series has filled, and not used, is still full
-        full = {v.name for v in vessels if v.liquid and not v.filled and (held[v.name] or (0.0,))[0] >= v.mass}
-        self._filled, self._laid_out = self._filled | fill.keys() | full, True
-        masses = {name: (self._record.held(name) or (self._vessels[name].mass,))[0] for name in self._vessels}
-        self._carrier.laid_out({vessel.name: vessel.place for vessel in vessels}, masses)
+        full = {v.name for v in vessels if v.liquid and not v.filled and masses[v.name] >= v.mass}
+        self._filled |= fill.keys() | full
+        self._laid_out = True
+        laid_out = {name: (self._record.held(name) or (self._vessels[name].mass,))[0] for name in self._vessels}
+        self._carrier.laid_out({vessel.name: vessel.place for vessel in vessels}, laid_out)
 
     def _empty(self, cup: str) -> None:
         """An empty, dry cup stands there."""

@@ -58,6 +58,7 @@ moved draws, and the uninformative group, which does not drift.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -180,19 +181,20 @@ class Hypotheses:
         further ones the bench may drift.
         """
         dimension = len(discrepancy.offset_priors)
-        # Columns: z of shifts and of factors, then h and g (all normal); σ, ℓ, s, the earlier offset, n and m as
-        # uniform numbers Φ(z).
-        z, rows = latent[:, : 2 * dimension], np.asarray(ndtr(latent[:, 2 * dimension :]))
+        # Columns: z of shifts and of factors, then h and g (all normal); σ, ℓ, s, the earlier offset, n, m and the
+        # drift as uniform numbers Φ(z).
+        z_shift, z_factor = latent[:, :dimension], latent[:, dimension : 2 * dimension]
         width, gain = latent[:, 2 * dimension : 2 * dimension + 2].T
-        residual, length, far, known, noise, growth = rows[:, 2:8].T
+        uniform = iter(np.asarray(ndtr(latent[:, 2 * dimension + 2 :])).T)
+        residual, length, far, earlier, noise, growth = itertools.islice(uniform, 6)
         near = far < NEAR_SHARE
         beyond = (far - NEAR_SHARE) / (1.0 - NEAR_SHARE)
         spread = np.where(near, _evenly(NEAR, far / NEAR_SHARE), _evenly(FARTHER, beyond))
         less = np.minimum(spread, 1.0)
-        scales, shifts = np.ones((len(rows), dimension)), np.zeros((len(rows), dimension))
+        scales, shifts = np.ones((len(latent), dimension)), np.zeros((len(latent), dimension))
         if discrepancy.drawn:
-            index = np.minimum((known / KNOWN_SHARE * len(discrepancy.drawn)).astype(int), len(discrepancy.drawn) - 1)
-            around = known < KNOWN_SHARE
+            index = np.minimum((earlier / KNOWN_SHARE * len(discrepancy.drawn)).astype(int), len(discrepancy.drawn) - 1)
+            around = earlier < KNOWN_SHARE
             spread = np.where(around, KNOWN_SPREAD, spread)
             scales[around] = np.array([offset.scales for offset in discrepancy.drawn])[index[around]]
             shifts[around] = np.array([offset.shifts for offset in discrepancy.drawn])[index[around]]
@@ -202,11 +204,11 @@ class Hypotheses:
         )
         # u ↦ f u + s shift z + (f − 1) origin, f = e^{s factor z}: a factor on the axis' value also moves its origin.
         # After an earlier offset (scales, shifts), the two maps are composed.
-        factors = np.exp(spread[:, None] * factor * z[:, dimension:])
-        moved = spread[:, None] * shift * z[:, :dimension] + (factors - 1.0) * origin
-        drift, pace = np.zeros(len(rows)), np.zeros((len(rows), 2 * dimension + 2))
+        factors = np.exp(spread[:, None] * factor * z_factor)
+        moved = spread[:, None] * shift * z_shift + (factors - 1.0) * origin
+        drift, pace = np.zeros(len(latent)), np.zeros((len(latent), 2 * dimension + 2))
         if latent.shape[1] > latent_size(dimension):
-            level, pace = rows[:, 8], latent[:, latent_size(dimension) + 1 :]
+            level, pace = next(uniform), latent[:, latent_size(dimension) + 1 :]
             drift = np.where(level < DRIFTING, _evenly(DRIFTS, level / DRIFTING), 0.0)
         return cls(
             factors * scales,

@@ -59,60 +59,95 @@ def describe(
     query: SurrogateQuery, arrays: QueryArrays, model: Model, points: Array, feasibility: Feasibility | None
 ) -> dict[str, object]:
     """Return the surrogate's results about the proposals, the observations and further points."""
-    other_space = isinstance(query, CalibrationQuery)
-    observed_points = arrays.known if len(arrays.known) else arrays.simulated
-    if feasibility is not None:
-        observed_points = observed_points[feasibility.likely(observed_points)]
-    if (allowed := arrays.region.allows(observed_points)).any():
-        observed_points = observed_points[allowed]  # prior data may lie outside the current constraints
-    means, deviations = model.surrogate.predict(points) if len(points) else (np.empty(0), np.empty(0))
-    at_known, known_deviations = model.surrogate.predict(observed_points)
-    expected = at_known
-    if feasibility is not None and len(arrays.costs):
-        # E = P m(x) + (1 − P) · (largest observed cost), P that the pour does not fail
-        probability = feasibility.made(observed_points)
-        expected = probability * at_known + (1.0 - probability) * arrays.costs.max()
-    best = int(np.argmin(expected))
-    description: dict[str, object] = {}
-    if query.equality is not None:
-        # between observations a surrogate falls below every cost, which makes no point better than the best observed
-        observed = arrays.costs if len(arrays.costs) else arrays.simulated_costs
-        limit = max(float(expected[best]), float(observed.min())) + query.equality.tolerance
-        equal = _EqualPoints(limit, query.equality.speed, query.space.names, arrays.region, model, feasibility)
-        best = equal.gentlest(observed_points, expected, query.seed)
-        description["equal_ranges"] = equal.ranges(observed_points[best])
-    process = model.process
-    description |= {
-        "means": tuple(map(float, means)),
-        "deviations": tuple(map(float, deviations)),
-        "noises": () if other_space else tuple(map(float, model.noise_at(points))),
-        "best_point": tuple(map(float, observed_points[best])),
-        "best_mean": float(at_known[best]),
-        "best_deviation": float(known_deviations[best]),
-        "best_noise": None if other_space else float(model.noise_at(observed_points[best : best + 1])[0]),
-        "hyperparameters": {
-            "signal": process.signal,
-            "noise": process.noise,
-            **({} if model.averaged is None else model.averaged.hyperparameters),
-            **dict(zip((f"length.{name}" for name in _axis_names(query)), map(float, process.lengths), strict=True)),
-        },
-    }
-    if model.averaged is not None and len(points):
-        description["bands"] = tuples(model.averaged.bands(points, LEVEL))
-    elif _announces_pours(query) and len(points) and len(process.points) <= MOST_AVERAGED:
-        description["bands"] = tuples(observation_intervals(model.process, points, LEVEL))
+    observed = _recommendable(arrays, feasibility)
+    means, deviations = model.surrogate.predict(observed)
+    best, ranges = _best(query, arrays, model, observed, means, feasibility)
+    description = _about_proposals(query, model, points)
+    description |= _about_best(query, model, observed[best], float(means[best]), float(deviations[best]))
+    if ranges is not None:
+        description["equal_ranges"] = ranges
     if query.predict_at:
-        predictions, spreads = model.surrogate.predict(
-            arrays.region.snap(array(query.predict_at, query.space.dimension))
-        )
+        places = arrays.region.snap(array(query.predict_at, query.space.dimension))
+        predictions, spreads = model.surrogate.predict(places)
         description["predictions"] = tuple(map(float, predictions))
         description["prediction_deviations"] = tuple(map(float, spreads))
     if query.map_resolution and query.space.dimension >= 2:
         sought = _seeks_minimum(query) and len(points) > 0
-        at = np.array(query.map_at) if query.map_at else points[0] if sought else observed_points[best]
+        at = np.array(query.map_at) if query.map_at else points[0] if sought else observed[best]
         across, up = sorted(int(i) for i in np.argsort(model.lengths, kind="stable")[:2])
         description["surrogate"] = mapped(query, arrays.region, model, at, (across, up), query.map_resolution)
     return description
+
+
+def _recommendable(arrays: QueryArrays, feasibility: Feasibility | None) -> Array:
+    """Places (n, dimension) that the best one is chosen from: observed ones that can probably be executed."""
+    observed = arrays.known if len(arrays.known) else arrays.simulated
+    if feasibility is not None:
+        observed = observed[feasibility.likely(observed)]
+    allowed = arrays.region.allows(observed)
+    return observed[allowed] if allowed.any() else observed  # prior data may lie outside the current constraints
+
+
+def _best(
+    query: SurrogateQuery,
+    arrays: QueryArrays,
+    model: Model,
+    observed: Array,
+    means: Array,
+    feasibility: Feasibility | None,
+) -> tuple[int, tuple[tuple[float, float], ...] | None]:
+    """Index of the best of the observed places (n, dimension) with posterior means (n,).
+
+    With `SurrogateQuery.equality`, also the ranges that are equal to it.
+    """
+    expected = means
+    if feasibility is not None and len(arrays.costs):
+        # E = P m(x) + (1 − P) · (largest observed cost), P that the pour does not fail
+        probability = feasibility.made(observed)
+        expected = probability * means + (1.0 - probability) * arrays.costs.max()
+    best = int(np.argmin(expected))
+    if query.equality is None:
+        return best, None
+    # between observations a surrogate falls below every cost, which makes no point better than the best observed
+    costs = arrays.costs if len(arrays.costs) else arrays.simulated_costs
+    limit = max(float(expected[best]), float(costs.min())) + query.equality.tolerance
+    equal = _EqualPoints(limit, query.equality.speed, query.space.names, arrays.region, model, feasibility)
+    best = equal.gentlest(observed, expected, query.seed)
+    return best, equal.ranges(observed[best])
+
+
+def _about_proposals(query: SurrogateQuery, model: Model, points: Array) -> dict[str, object]:
+    """Predictions at the proposals (m, dimension)."""
+    means, deviations = model.surrogate.predict(points) if len(points) else (np.empty(0), np.empty(0))
+    noises = () if isinstance(query, CalibrationQuery) else tuple(map(float, model.noise_at(points)))
+    description: dict[str, object] = {
+        "means": tuple(map(float, means)),
+        "deviations": tuple(map(float, deviations)),
+        "noises": noises,
+    }
+    if model.averaged is not None and len(points):
+        description["bands"] = tuples(model.averaged.bands(points, LEVEL))
+    elif _announces_pours(query) and len(points) and len(model.process.points) <= MOST_AVERAGED:
+        description["bands"] = tuples(observation_intervals(model.process, points, LEVEL))
+    return description
+
+
+def _about_best(query: SurrogateQuery, model: Model, place: Array, mean: float, deviation: float) -> dict[str, object]:
+    """The best place (dimension,) with its posterior mean and deviation, and the fitted values."""
+    process = model.process
+    lengths = zip((f"length.{name}" for name in _axis_names(query)), map(float, process.lengths), strict=True)
+    return {
+        "best_point": tuple(map(float, place)),
+        "best_mean": mean,
+        "best_deviation": deviation,
+        "best_noise": None if isinstance(query, CalibrationQuery) else float(model.noise_at(place[None, :])[0]),
+        "hyperparameters": {
+            "signal": process.signal,
+            "noise": process.noise,
+            **({} if model.averaged is None else model.averaged.hyperparameters),
+            **dict(lengths),
+        },
+    }
 
 
 EQUAL_PLACES = 1024

@@ -303,7 +303,7 @@ class PosteriorSource:
     simulator: str
     every: Callable[[], Sequence[KnownPosterior]]
     of_run: Callable[[str], KnownPosterior]
-    stale: Callable[[KnownPosterior], str] = lambda known: ""
+    stale: Callable[[KnownPosterior], str] = lambda posterior: ""
 
 
 def no_posteriors() -> PosteriorSource:
@@ -390,67 +390,112 @@ def _combined(posteriors: Sequence[KnownPosterior], needs: PriorNeeds, source: P
     """Combine the posteriors that fit, parameter by parameter."""
     left_out: list[str] = []
     usable: list[KnownPosterior] = []
-    for known in posteriors:
-        reasons = _unfit(known, needs, source)
+    for posterior in posteriors:
+        reasons = _unfit(posterior, needs, source)
         if reasons:
-            left_out.append(f"{known.posterior}: {'; '.join(reasons)}")
+            left_out.append(f"{posterior.posterior}: {'; '.join(reasons)}")
         else:
-            usable.append(known)
+            usable.append(posterior)
     if not posteriors:
         left_out.append("the catalogue has no posterior yet: a calibration with C4 makes one")
-    shape, infos = shape_digest(scene_by_content(needs.scene)), SimulationParameters.info()
-    for known in usable:
-        if (difference := _liquid_differs(known, needs.scene)) and any(group_of(n) == LIQUID for n in known.estimates):
-            left_out.append(f"{known.posterior}: its {LIQUID} is not transferred, {difference}")
-        if known.laboratory != needs.laboratory.name and any(group_of(n) == PLACEMENT for n in known.estimates):
-            text = f"it is of laboratory '{known.laboratory}', here it is '{needs.laboratory.name}'"
-            left_out.append(f"{known.posterior}: its {PLACEMENT} is not transferred, {text}")
-    local = [known for known in usable if known.laboratory == needs.laboratory.name]
-    moved = {name: known.posterior for known in local for name in known.contradicts}
-    for known in local:
-        if known.posterior in moved and any(group_of(n) == PLACEMENT for n in known.estimates):
-            text = f"the pours of {moved[known.posterior]} contradict it"
-            left_out.append(f"{known.posterior}: its {PLACEMENT} is not transferred, {text}")
-    remembered = []
-    for name, (lower, upper) in needs.wanted.items():
-        group = group_of(name)
-        told = [known for known in usable if name in known.estimates]
-        if group == LIQUID:
-            told = [known for known in told if not _liquid_differs(known, needs.scene)]
-        elif group == PLACEMENT:
-            told = [known for known in local if name in known.estimates and known.posterior not in moved]
-        same_vessel = [known for known in told if known.shape == shape]
-        if group == WALLS and same_vessel:
-            told = same_vessel
-        if group is None or not told:
+    local = [posterior for posterior in usable if posterior.laboratory == needs.laboratory.name]
+    contradicted = {name: posterior.posterior for posterior in local for name in posterior.contradicts}
+    left_out += _groups_left_out(usable, contradicted, needs)
+    remembered: list[RememberedParameter] = []
+    for name in needs.wanted:
+        parameter, reason = _remembered(name, usable, contradicted, needs)
+        if parameter is not None:
+            remembered.append(parameter)
+        elif reason:
+            left_out.append(reason)
+    pours = () if needs.poured is None else _transferred_pours(usable, remembered, needs, left_out)
+    runs = {run for parameter in remembered for run in parameter.runs}
+    stale = [(posterior.posterior, source.stale(posterior)) for posterior in usable if posterior.posterior in runs]
+    texts = tuple(f"{name}: {text}" for name, text in stale if text)
+    return CampaignMemory(tuple(remembered), tuple(left_out), texts, pours or None)
+
+
+def _groups_left_out(usable: Sequence[KnownPosterior], contradicted: Mapping[str, str], needs: PriorNeeds) -> list[str]:
+    """Reasons why the liquid or the placement of usable posteriors is not transferred.
+
+    Args:
+        contradicted: posteriors whose placement later pours contradict, with the run of these pours.
+    """
+
+    def tells(posterior: KnownPosterior, group: str) -> bool:
+        return any(group_of(name) == group for name in posterior.estimates)
+
+    elsewhere, here = [], []
+    for posterior in usable:
+        name, laboratory = posterior.posterior, posterior.laboratory
+        difference = _liquid_differs(posterior, needs.scene)
+        if difference and tells(posterior, LIQUID):
+            elsewhere.append(f"{name}: its {LIQUID} is not transferred, {difference}")
+        if not tells(posterior, PLACEMENT):
             continue
-        if name in needs.measured:
-            left_out.append(f"{name}: the campaign gives what was measured")
-            continue
-        spread = usual_spread(infos[name], same_vessel=bool(same_vessel))
-        mean, deviation = predicted([known.estimates[name] for known in told], spread)
-        mean = min(max(mean, infos[name].lower), infos[name].upper)
-        parameter = RememberedParameter(name, mean, deviation, tuple(known.posterior for known in told))
-        if not lower - 3.0 * deviation <= mean <= upper + 3.0 * deviation:
-            left_out.append(f"{parameter} is outside the searched range; widen the range")
-            continue
-        remembered.append(parameter)
-    used = {run for parameter in remembered for run in parameter.runs}
+        if laboratory != needs.laboratory.name:
+            text = f"it is of laboratory '{laboratory}', here it is '{needs.laboratory.name}'"
+            elsewhere.append(f"{name}: its {PLACEMENT} is not transferred, {text}")
+        elif name in contradicted:
+            text = f"the pours of {contradicted[name]} contradict it"
+            here.append(f"{name}: its {PLACEMENT} is not transferred, {text}")
+    return elsewhere + here
+
+
+def _remembered(
+    name: str, usable: Sequence[KnownPosterior], contradicted: Mapping[str, str], needs: PriorNeeds
+) -> tuple[RememberedParameter | None, str]:
+    """What the posteriors tell about a wanted parameter; None without anything, or for the returned reason."""
+    group, info = group_of(name), SimulationParameters.info()[name]
+    sources = [posterior for posterior in usable if name in posterior.estimates]
+    if group == LIQUID:
+        sources = [posterior for posterior in sources if not _liquid_differs(posterior, needs.scene)]
+    elif group == PLACEMENT:
+        here = [posterior for posterior in sources if posterior.laboratory == needs.laboratory.name]
+        sources = [posterior for posterior in here if posterior.posterior not in contradicted]
+    vessel = shape_digest(scene_by_content(needs.scene))
+    same_vessel = [posterior for posterior in sources if posterior.shape == vessel]
+    if group == WALLS and same_vessel:
+        sources = same_vessel
+    if group is None or not sources:
+        return None, ""
+    if name in needs.measured:
+        return None, f"{name}: the campaign gives what was measured"
+    spread = usual_spread(info, same_vessel=bool(same_vessel))
+    mean, deviation = predicted([posterior.estimates[name] for posterior in sources], spread)
+    mean = min(max(mean, info.lower), info.upper)
+    parameter = RememberedParameter(name, mean, deviation, tuple(posterior.posterior for posterior in sources))
+    lower, upper = needs.wanted[name]
+    if not lower - 3.0 * deviation <= mean <= upper + 3.0 * deviation:
+        return None, f"{parameter} is outside the searched range; widen the range"
+    return parameter, ""
+
+
+def _transferred_pours(
+    usable: Sequence[KnownPosterior],
+    remembered: Sequence[RememberedParameter],
+    needs: PriorNeeds,
+    left_out: list[str],
+) -> tuple[WeighedPair, ...]:
+    """The weighed pours of the newest posteriors that say something about the simulator here.
+
+    Args:
+        left_out: reasons for the others are added here.
+    """
     pours: list[WeighedPair] = []
     older = 0
-    for known in reversed(usable) if needs.poured is not None else ():  # the newest first
-        lost = [n for n in known.estimates if not any(n == p.name and known.posterior in p.runs for p in remembered)]
-        if reason := _pours_unfit(known, needs, lost):
-            left_out.append(f"{known.posterior}: its weighed pours are not transferred, {reason}")
+    told = {(parameter.name, run) for parameter in remembered for run in parameter.runs}
+    for posterior in reversed(usable):  # the newest first
+        lost = [name for name in posterior.estimates if (name, posterior.posterior) not in told]
+        if reason := _pours_unfit(posterior, needs, lost):
+            left_out.append(f"{posterior.posterior}: its weighed pours are not transferred, {reason}")
         elif len(pours) >= ENOUGH:
             older += 1
         else:
-            pours += [settings.pair(known.posterior) for settings in known.weighed]
+            pours += [settings.pair(posterior.posterior) for settings in posterior.weighed]
     if older:
         left_out.append(f"weighed pours of {older} older run{'s' * (older > 1)}: {len(pours)} of newer ones are enough")
-    stale = [(known.posterior, source.stale(known)) for known in usable if known.posterior in used]
-    texts = tuple(f"{name}: {text}" for name, text in stale if text)
-    return CampaignMemory(tuple(remembered), tuple(left_out), texts, tuple(pours) or None)
+    return tuple(pours)
 
 
 def _pours_unfit(earlier: KnownPosterior, needs: PriorNeeds, lost: Sequence[str]) -> str:

@@ -190,23 +190,15 @@ def resolve_calibration(
     if further and pours.source is not None:
         text = "stands beside pours that are read 'from' a file, which were made into one; keep 'receiver'"
         report.add(place.at("receivers"), text, key=True)
-    tested: list[Scene | None] = []
-    for i, value in enumerate(pours.holdout_receivers or ()):
-        vessel = builder.references.vessel(value, at.at("holdout_receivers", i))
-        if vessel is not None and scene is not None:
-            name = f"calibration-{vessel.name}"
-            if name in {other.name for other in (*further, *tested) if other is not None}:
-                report.add(at.at("holdout_receivers", i), f"'{vessel.name}' is poured into already")
-            tested.append(ground.scene(name, vessel))
     others = tuple(other for other in further if other is not None)
-    unseen = tuple(other for other in tested if other is not None)
+    tested = _tested_scenes(pours, at, ground, scene, others)
     records = transfer = None
     if pours.source is not None:
         records, transfer = resolve_records(pours, at, builder, table, actions, scene, ground.pourer, ground.motions)
     elif pours.from_run is not None:
         if scene is not None and actions is not None:
             records = records_of_run(
-                pours.from_run, at.at("from_run"), (scene, *others, *unseen), actions, laboratory, report
+                pours.from_run, at.at("from_run"), (scene, *others, *tested), actions, laboratory, report
             )
     elif pours.count and laboratory is not None and not laboratory.pours:
         text = f"laboratory '{laboratory.name}' has no bench to pour on; name a CSV file with 'from'"
@@ -216,13 +208,8 @@ def resolve_calibration(
     settings = None
     if not report.is_broken(place.at("strategy")):
         train = count - holdout if records is None else records.training_pours
-        source = at.at("from" if pours.source is not None else "from_run")
-        if records is not None and train < LEAST_TRAINING_POURS and not report.is_broken(source):
-            text = (
-                f"has {train or 'no'} training pour{'s' * (train != 1)} with at least {MINIMUM_POURED:.0%} poured; a "
-                f"calibration needs {LEAST_TRAINING_POURS}"
-            )
-            report.add(source, text)
+        if records is not None:
+            _check_training_pours(train, at.at("from" if pours.source is not None else "from_run"), report)
         problems = PlacedProblems(place, report, frozenset(CalibrationSection.model_fields))
         settings = section.settings.settled(tuple(searched), train, problems)
     if scene is None or len(others) < len(receivers) - 1 or actions is None or settings is None or not searched:
@@ -242,8 +229,43 @@ def resolve_calibration(
         random_baseline=section.random_baseline,
         parameter_prior=priors,
         further=others,
-        tested=unseen,
+        tested=tested,
     )
+
+
+def _tested_scenes(
+    pours: PoursSettings, at: Place, ground: StageGround, scene: Scene | None, others: tuple[Scene, ...]
+) -> tuple[Scene, ...]:
+    """Scenes with the receivers that are held out for testing.
+
+    Args:
+        at: place of the pours.
+        scene: with the first receiver; None after a problem.
+        others: scenes with the other receivers.
+    """
+    tested: list[Scene] = []
+    for i, value in enumerate(pours.holdout_receivers or ()):
+        place = at.at("holdout_receivers", i)
+        vessel = ground.builder.references.vessel(value, place)
+        if vessel is None or scene is None:
+            continue
+        name = f"calibration-{vessel.name}"
+        if name in {other.name for other in (*others, *tested)}:
+            ground.builder.report.add(place, f"'{vessel.name}' is poured into already")
+        held_out = ground.scene(name, vessel)
+        if held_out is not None:
+            tested.append(held_out)
+    return tuple(tested)
+
+
+def _check_training_pours(count: int, source: Place, report: Report) -> None:
+    """Check that enough pours of a file or of an earlier run can be fitted."""
+    if count < LEAST_TRAINING_POURS and not report.is_broken(source):
+        report.add(
+            source,
+            f"has {count or 'no'} training pour{'s' * (count != 1)} with at least {MINIMUM_POURED:.0%} poured; a "
+            f"calibration needs {LEAST_TRAINING_POURS}",
+        )
 
 
 def _prior(

@@ -129,34 +129,22 @@ def _resolved(text: str, columns: Sequence[KnownColumn], renamed: Mapping[str, s
         raise QuantityError("a column has no name")
     bracketed = _BRACKETS.fullmatch(text)
     stem, unit = (bracketed[1], bracketed[2]) if bracketed else (text, "")
-    name = renamed.get(text) or renamed.get(stem, stem)
-    names = {entry.name: entry for entry in columns} | {entry.standard: entry for entry in columns}
-    word = re.sub(r"[\s-]+", "_", name.strip()).lower()
-    column = names.get(name) or names.get(word) or next((entry for entry in columns if word in entry.aliases), None)
-    alias = column is not None and word in column.aliases
-    standard = column is not None and word == column.standard.lower()
+    name = (renamed.get(text) or renamed.get(stem, stem)).strip()
+    word = re.sub(r"[\s-]+", "_", name).lower()
     if text in renamed and not is_unit(unit):
         unit = ""  # a part of the name: 'weight (net)'
-    if column is not None and not unit:
-        if column.unit and not standard:
-            text = f"write '{column.standard}' or '{column.name} [{column.display}]'"
-            raise QuantityError(f"has no unit; {text} if that is what is meant")
-        return FoundColumn(column.standard)
+    column, alias = _named(name, word, columns)
     if column is None and not unit:
-        column = next((c for c in columns if c.unit and re.fullmatch(rf"{c.name}_[a-zµ°%_0-9]+", word)), None)
-        if column is not None:
-            suffix = name.strip()[len(column.name) + 1 :]
-            unit = re.sub(r"(?<=[a-z])(?=[0-9])", "^", suffix.replace("_", "/"))
+        column, unit = _with_unit_in_name(name, word, columns)
+    elif column is not None and not unit:
+        if column.unit and word != column.standard.lower():
+            remedy = f"write '{column.standard}' or '{column.name} [{column.display}]'"
+            raise QuantityError(f"has no unit; {remedy} if that is what is meant")
+        return FoundColumn(column.standard)
     if column is None:
         if text in renamed:
             raise QuantityError(f"'columns' gives it the name '{renamed[text]}', which is not known")
-        guess = did_you_mean(word, names) or did_you_mean(word, [entry.standard for entry in columns])
-        shown = names[guess].standard if guess else ""
-        if not guess:
-            raise _UnknownColumnError(
-                f"unknown column; known columns: {', '.join(entry.standard for entry in columns)}"
-            )
-        raise _UnknownColumnError(f"unknown column; did you mean '{shown}'?", shown)
+        raise _unknown(word, columns)
     if not column.unit:
         raise QuantityError(f"'{column.name}' has no unit; remove '{unit}'")
     if unit == column.display:
@@ -165,6 +153,44 @@ def _resolved(text: str, columns: Sequence[KnownColumn], renamed: Mapping[str, s
     factor = parse_unit(unit, column.unit, example) / parse_unit(column.display, column.unit, example)
     if math.isclose(factor, 1.0, rel_tol=1e-12):
         return FoundColumn(column.standard, alias=alias)
-    if standard and text not in renamed:
+    if word == column.standard.lower() and text not in renamed:
         raise QuantityError(f"has two units; write '{column.name} [{unit}]' or '{column.standard}'")
     return FoundColumn(column.standard, factor, alias)
+
+
+def _named(name: str, word: str, columns: Sequence[KnownColumn]) -> tuple[KnownColumn | None, bool]:
+    """The column with a name, a standard name or an alias, in this order; and whether it is an alias.
+
+    Args:
+        name: as written, without its unit.
+        word: the same in lower case, with underscores.
+    """
+    names = _names(columns)
+    alias = next((entry for entry in columns if word in entry.aliases), None)
+    column = names.get(name) or names.get(word) or alias
+    return column, column is not None and word in column.aliases
+
+
+def _names(columns: Sequence[KnownColumn]) -> dict[str, KnownColumn]:
+    """The columns by name and by standard name."""
+    return {entry.name: entry for entry in columns} | {entry.standard: entry for entry in columns}
+
+
+def _with_unit_in_name(name: str, word: str, columns: Sequence[KnownColumn]) -> tuple[KnownColumn | None, str]:
+    """The column whose name has a unit appended, and the unit: 'angular_velocity_rad_s' has 'rad/s'."""
+    for column in columns:
+        if column.unit and re.fullmatch(rf"{column.name}_[a-zµ°%_0-9]+", word):
+            suffix = name[len(column.name) + 1 :].replace("_", "/")
+            return column, re.sub(r"(?<=[a-z])(?=[0-9])", "^", suffix)  # 's2' is s^2
+    return None, ""
+
+
+def _unknown(word: str, columns: Sequence[KnownColumn]) -> _UnknownColumnError:
+    """The error about a name that is none of the columns', with the most similar one."""
+    names = _names(columns)
+    guess = did_you_mean(word, names) or did_you_mean(word, [entry.standard for entry in columns])
+    if not guess:
+        listed = ", ".join(entry.standard for entry in columns)
+        return _UnknownColumnError(f"unknown column; known columns: {listed}")
+    standard = names[guess].standard
+    return _UnknownColumnError(f"unknown column; did you mean '{standard}'?", standard)

@@ -1,8 +1,8 @@
-"""What all verbs share: reading a campaign, running a task in front of a person.
+"""Runs of the commands: reads a campaign, runs a task in the foreground, and ends the command with its verdict.
 
-What a run that was interrupted or broke off leaves behind, and what to do about it, in words.
-
-Who answers while a command runs: the person at the terminal, or nobody.
+- `read_campaign` and `read_draws` read the files of a command; `check_campaign_can_run` refuses a run before it starts.
+- `run_at_terminal` runs a task. After an interruption or a failure it prints the next command.
+- `resources_with_operator` selects the answerer of questions: the operator at the terminal, or none.
 """
 
 from __future__ import annotations

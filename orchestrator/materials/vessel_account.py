@@ -107,17 +107,24 @@ class VesselContent:
     def json_content(self) -> dict[str, Any]:
         """The content for JSON, masses in g."""
         return {
-            **{"mass_g": None if self.mass is None else 1e3 * self.mass, "deviation_g": 1e3 * self.deviation},
-            **{"liquid": self.liquid, "since": self.time, "pour": self.pour, "weighed": self.weighed},
+            "mass_g": None if self.mass is None else 1e3 * self.mass,
+            "deviation_g": 1e3 * self.deviation,
+            "liquid": self.liquid,
+            "since": self.time,
+            "pour": self.pour,
+            "weighed": self.weighed,
         }
 
     def json_entry(self) -> dict[str, Any]:
         """The entry for JSON, masses in g."""
         content = self.json_content()
         return {
-            **{"t": self.time, "vessel": self.vessel, "kind": self.kind},
+            "t": self.time,
+            "vessel": self.vessel,
+            "kind": self.kind,
             **{name: content[name] for name in ("mass_g", "deviation_g", "liquid", "pour")},
-            **{"by": self.by, "note": self.note},
+            "by": self.by,
+            "note": self.note,
         }
 
 

@@ -34,18 +34,18 @@ CFL = 1.5
 """Largest displacement per step, in spacings."""
 LONGEST_STEP = 4e-3
 PACE = 0.18
-"""… and the longest step in units of √(d/g): in a longer one gravity presses layers together faster than the iterations
-separate them."""
+"""Longest step in units of √(d/g): in a longer one gravity presses layers together faster than the iterations separate
+them."""
 SHORTEST_STEP = 1e-4
 ITERATIONS = 2
-"""Least number of passes over the density constraint in a step; …"""
+"""Least number of passes over the density constraint in a step."""
 TOLERANCE = 0.015
-"""… more while the mean compression inside exceeds this: a deep vessel needs more than a shallow one; …"""
+"""Mean compression inside above which a step makes more passes: a deep vessel needs more than a shallow one."""
 STRAIN = 0.002
-"""The same in thick liquids, for what a step adds to the compression: it remains in the velocities. At 0.015 liquid at
-rest kept falling by three times g dt in every step, and `decompress` raised it again."""
+"""The same bound in thick liquids, for the compression that a step adds, which remains in the velocities. At 0.015
+liquid at rest kept falling by three times g dt in every step, and `decompress` raised it again."""
 MOST_ITERATIONS = 30
-"""… and the largest number of passes."""
+"""Largest number of passes over the density constraint in a step."""
 SKIN = 0.03
 """Reach of neighbour lists beyond the support, in spacings. With a skin of 0.3 lists lasted for three steps of calm
 liquid, but they were half as long again, which slowed every pass over them."""

@@ -92,20 +92,20 @@ FADES, ENDS = 0.75, 1.25
 one layer."""
 ACCURACY = 2e-3
 """Conjugate gradients end when the residual is this fraction of the velocity that gravity gives in a step (root mean
-squares) …
+squares).
 """
 COARSELY = 1e-4
-"""… or this fraction of the velocities themselves, if there is no gravity."""
+"""Without gravity, conjugate gradients end when the residual is this fraction of the velocities."""
 MOST_PASSES = 80
 STIFFEST = 0.2
 """Longest step in units of d²/ν: pressure acts after viscosity, and in a longer step each would hide the other. At
 0.4 vortices of 2,000 mm²/s decayed by 17 % too slowly."""
 ALONE = SIGMA / SUPPORT**3
-"""Kernel sum of a single particle, W(0) d³ …"""
+"""Kernel sum of a single particle, W(0) d³."""
 BESIDE = 0.386
-"""… the part that its neighbours in a plane layer add …"""
+"""Part of the kernel sum that the neighbours of a particle in a plane layer add."""
 ABOVE = 0.16
-"""… and the part of a layer above, times its height in spacings."""
+"""Part of the kernel sum of a layer above, times its height in spacings."""
 SPARSEST = 0.3
 """Least cover of a wall by the layer next to it, in particles per d²."""
 THINNEST = 0.15
@@ -428,7 +428,8 @@ NEIGHBOURHOOD, INSIDE = 0.6, 0.9
 """A particle gets part of the correction from det M = NEIGHBOURHOOD on, and all of it from INSIDE on. If it begins at
 0.4, liquid at rest boils."""
 COVERED, SURROUNDED = 0.85, 0.95
-"""… or from the density ρ/ρ₀ = COVERED on, and SURROUNDED. It includes the walls' part: a plane surface has 0.8."""
+"""A particle also gets part of the correction from the density ρ/ρ₀ = COVERED on, and all of it from SURROUNDED on. The
+density includes the walls' part: a plane surface has 0.8."""
 LEAST_DETERMINANT = 0.1
 """Below it M is not inverted."""
 

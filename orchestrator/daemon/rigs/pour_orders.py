@@ -51,6 +51,7 @@ from orchestrator.runs.run_service import RunRequest
 from orchestrator.runs.run_tasks import single_task
 from orchestrator.runs.stages import POUR, scenes_of
 from sim_engine.action import ACTION_DIMENSIONS, Action
+from sim_engine.liquids import Liquid
 from sim_engine.motion import plan_motion
 from sim_engine.outcome import Loss, PourMeasurement
 from sim_engine.scene import PourTask, Scene
@@ -249,27 +250,14 @@ class PlannedOrder:
             for name, dimension in ACTION_DIMENSIONS.items()
             if (value := action.values()[name]) is not None or dimension.switched_off
         }
-        amount, tolerance = f"{order.amount!r} kg", f"{order.tolerance!r} kg"
-        loaded = {"name": "water", **order.properties, "mass": f"{liquid.mass!r} kg"}
-        poured: dict[str, Any] = {"liquid": loaded}
-        poured |= (
-            {"pour": True}
-            if order.amount is None
-            else {"dispense": {"doses": [{"amount": amount, "tolerance": tolerance}]}}
-        )
-        if carried_cup(order, rig.spec):
-            rack, _, cup = order.position.partition("/")
-            poured = {
-                "mixtures": {
-                    "liquids": [{"name": order.liquid, "liquid": loaded, "stands": [order.stand]}],
-                    **{"cups": {"rack": rack}, "wanted": {cup: {order.liquid: amount}}},
-                    **{"tolerance": tolerance, "start": "as_left"},
-                }
-            }
         record = {
-            **{"name": POUR, "seed": order.seed, "laboratory": laboratory_record(rig.source or shipped(VIRTUAL))},
-            **{"pourer": order.pourer, "receiver": order.vessel, "motion": motion},
-            **poured,
+            "name": POUR,
+            "seed": order.seed,
+            "laboratory": laboratory_record(rig.source or shipped(VIRTUAL)),
+            "pourer": order.pourer,
+            "receiver": order.vessel,
+            "motion": motion,
+            **_poured_sections(order, liquid, carried=bool(carried_cup(order, rig.spec))),
             "outputs": {"recording": False, "figures": False},
         }
         plan = campaign_from(Document.parse(json.dumps(record), folder / ORDER))
@@ -376,6 +364,26 @@ class PlannedOrder:
             "spilled_g": load * spilled.mean,
             "simulations": result.simulations,
         }
+
+
+def _poured_sections(order: PourOrder, liquid: Liquid, *, carried: bool) -> dict[str, Any]:
+    """The sections of a campaign's file that pour an order: one pour, one dose, or one cup that the arm carries."""
+    loaded = {"name": "water", **order.properties, "mass": f"{liquid.mass!r} kg"}
+    amount, tolerance = f"{order.amount!r} kg", f"{order.tolerance!r} kg"
+    if order.amount is None:
+        return {"liquid": loaded, "pour": True}
+    if not carried:
+        return {"liquid": loaded, "dispense": {"doses": [{"amount": amount, "tolerance": tolerance}]}}
+    rack, _, cup = order.position.partition("/")
+    return {
+        "mixtures": {
+            "liquids": [{"name": order.liquid, "liquid": loaded, "stands": [order.stand]}],
+            "cups": {"rack": rack},
+            "wanted": {cup: {order.liquid: amount}},
+            "tolerance": tolerance,
+            "start": "as_left",
+        }
+    }
 
 
 def _action(assigned: Mapping[str, str], fixed: Mapping[str, float | None]) -> Action:

@@ -1,6 +1,6 @@
-"""What happens at one rig: it takes a campaign from the queue, keeps it until it rests, and takes the next.
+"""The work of one rig: `RigWorker` takes a campaign from the queue, keeps it until it rests, and takes the next.
 
-One campaign on one rig, from its snapshot to its published results; and the ways to end it sooner.
+`Running` is one campaign at the rig, from its snapshot to its published results, with the ways to end it sooner.
 """
 
 from __future__ import annotations
@@ -401,7 +401,7 @@ class Running:
 
 
 RETRY = 30.0
-"""Before a lane that was kept from beginning looks again [s]."""
+"""Time after which a rig that could not begin a campaign tries again [s]."""
 
 
 @dataclass(frozen=True)
