@@ -648,17 +648,7 @@ def check_campaign(
         )
         warn(checker.problem((("outputs", "pour_recordings"),), text))
     if plan.calibration is not None:
-        calibration, section = plan.calibration, ("calibration",)
-        if calibration.records is None:
-            for scene in calibration.poured:
-                checker.reachable(calibration, scene, _Role("calibration", section))
-        else:
-            pours, at = calibration.records.pours, ("calibration", "pours")
-            checker.recorded(calibration.scene, [p.action for p in pours], _Role("calibration.pours", section), at)
-        if calibration.transfer is not None:
-            transfer, at = calibration.transfer, ("calibration", "pours", "transfer")
-            role = _Role("calibration.pours.transfer", section, ((*at, "receiver"),))
-            checker.recorded(transfer.scene, [p.action for p in transfer.pours], role, at)
+        _check_calibration(plan.calibration, checker)
     if plan.deployment is not None:
         for i, scene in enumerate(plan.deployment.scenes):
             receiver = (("deployment", "receiver"), ("deployment", "receivers", i), ("receivers", i))
@@ -666,22 +656,42 @@ def check_campaign(
             checker.reachable(plan.deployment, scene, role)
     if plan.pour is not None:
         checker.pour(plan.pour)
-    if plan.dispense is not None and lab.places:
-        checker.carried_doses(plan.dispense, lab.vessels)
     if plan.dispense is not None:
-        balance = plan.laboratory.balance
-        if plan.laboratory.arm is not None and (balance is None or balance.placement not in ("receiver", "everything")):
-            text = (
-                f"laboratory '{plan.laboratory.name}': wanted amounts need a connected balance under the receiver; "
-                "write 'balance: {placement: receiver}' and set it up so"
-            )
-            checker.add((dose_section(plan.dispense), ("laboratory",)), text)
-        before = len(checker.problems)
-        checker.doses(plan.dispense, simulated=plan.laboratory.arm is None)
-        checker.display(plan.dispense, lab)
-        if plan.dispense.mixtures is not None and len(checker.problems) == before:
-            checker.mixtures(plan, tell)
+        _check_doses(plan, plan.dispense, checker, tell)
     return list(dict.fromkeys(checker.problems))
+
+
+def _check_calibration(plan: CalibrationPlan, checker: _Checker) -> None:
+    at: Loc
+    section = ("calibration",)
+    if plan.records is None:
+        for scene in plan.poured:
+            checker.reachable(plan, scene, _Role("calibration", section))
+    else:
+        at = ("calibration", "pours")
+        actions = [pour.action for pour in plan.records.pours]
+        checker.recorded(plan.scene, actions, _Role("calibration.pours", section), at)
+    if plan.transfer is not None:
+        at = ("calibration", "pours", "transfer")
+        role = _Role("calibration.pours.transfer", section, ((*at, "receiver"),))
+        checker.recorded(plan.transfer.scene, [pour.action for pour in plan.transfer.pours], role, at)
+
+
+def _check_doses(plan: CampaignPlan, dispense: DispensePlan, checker: _Checker, tell: Callable[[str], None]) -> None:
+    laboratory, balance = plan.laboratory, plan.laboratory.balance
+    if laboratory.places:
+        checker.carried_doses(dispense, laboratory.vessels)
+    if laboratory.arm is not None and (balance is None or balance.placement not in ("receiver", "everything")):
+        text = (
+            f"laboratory '{laboratory.name}': wanted amounts need a connected balance under the receiver; "
+            "write 'balance: {placement: receiver}' and set it up so"
+        )
+        checker.add((dose_section(dispense), ("laboratory",)), text)
+    before = len(checker.problems)
+    checker.doses(dispense, simulated=laboratory.arm is None)
+    checker.display(dispense, laboratory)
+    if dispense.mixtures is not None and len(checker.problems) == before:
+        checker.mixtures(plan, tell)
 
 
 def _dosed(plan: DispensePlan, vessel: str) -> tuple[Loc, ...]:

@@ -9,7 +9,7 @@ Sections are validated before (`orchestrator.campaigns.yaml.section_validation`)
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from orchestrator.campaigns.campaign_file import (
     CampaignFile,
     DeploymentSection,
     LearningSettings,
+    MixturesSettings,
     PoursSettings,
     StageSettings,
     owners_of_priors,
@@ -40,6 +41,7 @@ from orchestrator.learning.campaign_plan import (
     CalibrationPlan,
     CampaignPlan,
     DeploymentPlan,
+    DispensePlan,
     NormalPrior,
 )
 from orchestrator.learning.deployment.objectives import STOPS
@@ -292,22 +294,80 @@ def resolve_campaign(
     """The plan of a campaign. Problems are added to the report; the plan may then be None."""
     references = References(report)
     laboratory: LaboratorySettings | None = references.laboratory(file.laboratory, root.at("laboratory"))
-    liquid = references.liquid(file.liquid, root.at("liquid"))
-    builder = SceneBuilder(file, root, references, liquid)
+    builder = SceneBuilder(file, root, references, references.liquid(file.liquid, root.at("liquid")))
     for role in ("pourer", "receiver"):  # checked even if the sections override it
         if file.value(role) is not None:
             references.vessel(file.value(role), root.at(role))
-    parameters: ParametersBase | None = file.simulator.parameters
-    fixed = {} if parameters is None else parameters.fixed()
-    searched = {} if parameters is None else parameters.searched()
-    default = SimulationParameters().model_dump()
-    fixed = SimulationParameters.from_values(fixed).fixed_values(searched)
-    calibration = deployment = None
+    sections = _resolved_sections(file, builder, root, laboratory)
+    memory = None
+    if file.prior is not None and laboratory is not None and not report.problems:
+        memory = _memory(file, sections, laboratory, root.at("prior"), references, posteriors)
+    sections = sections.with_memory(file, memory).with_arm_limits(laboratory)
+    _check_actions(file, builder, root)
+    if laboratory is not None:
+        _check_repeating(file, sections, laboratory, root.at("on_unknown"), report)
+        _check_unattended(file, laboratory, root.at("unattended"), report)
+    if report.problems or laboratory is None:
+        return None
+    return _campaign_plan(file, sections, laboratory, memory, root, references)
+
+
+@dataclass(frozen=True)
+class _Sections:
+    """The sections of a campaign as plans; None for a section that is missing or has problems.
+
+    Attributes:
+        mixtures: the section that the doses of mixtures are made from, with its defaults.
+        pour: scene of a single pour.
+    """
+
+    calibration: CalibrationPlan | None
+    deployment: DeploymentPlan | None
+    dispense: DispensePlan | None
+    mixtures: MixturesSettings | None
+    pour: Scene | None
+
+    def with_memory(self, file: CampaignFile, memory: CampaignMemory | None) -> _Sections:
+        """The same with the prior in the stage that uses it."""
+        if file.calibration is not None and self.calibration is not None:
+            design, simulations = file.calibration.pours.designed(memory)
+            calibration = replace(self.calibration, memory=memory, design=design, design_simulations=simulations)
+            return replace(self, calibration=calibration)
+        if memory is not None and self.deployment is not None:
+            return replace(self, deployment=replace(self.deployment, memory=memory))
+        return self
+
+    def with_arm_limits(self, laboratory: LaboratorySettings | None) -> _Sections:
+        """The same with the arm's limits as constraints on the pours that it will make."""
+        calibration, deployment = self.calibration, self.deployment
+        if calibration is not None and calibration.records is None:
+            limits = _arm_limits(calibration.actions, laboratory)
+            calibration = replace(calibration, constraints=(*calibration.constraints, *limits))
+        if deployment is not None:
+            limits = _arm_limits(deployment.actions, laboratory)
+            deployment = replace(deployment, constraints=(*deployment.constraints, *limits))
+        return replace(self, calibration=calibration, deployment=deployment)
+
+    @property
+    def prior_means(self) -> Mapping[str, float]:
+        """Parameters that a deployment without a calibration takes from its prior."""
+        if self.calibration is not None or self.deployment is None or self.deployment.memory is None:
+            return {}
+        return self.deployment.memory.means
+
+
+def _resolved_sections(
+    file: CampaignFile, builder: SceneBuilder, root: Place, laboratory: LaboratorySettings | None
+) -> _Sections:
+    calibration = deployment = dispense = pour = None
     if file.calibration is not None:
+        parameters: ParametersBase | None = file.simulator.parameters
+        fixed = {} if parameters is None else parameters.fixed()
+        searched = {} if parameters is None else parameters.searched()
         calibration = resolve_calibration(
             file.calibration,
             builder,
-            fixed,
+            SimulationParameters.from_values(fixed).fixed_values(searched),
             searched,
             root.at("calibration"),
             laboratory,
@@ -315,77 +375,82 @@ def resolve_campaign(
         )
     if file.deployment is not None:
         deployment = resolve_deployment(file.deployment, builder, root.at("deployment"), laboratory)
-    dispense, mixtures = None, file.mixtures
+    mixtures = file.mixtures
     if file.dispense is not None:
         dispense = resolve_dispense(file.dispense, builder, root.at("dispense"), laboratory)
     elif mixtures is not None:
         dispense, mixtures = resolve_mixtures(mixtures, builder, root.at("mixtures"), laboratory)
-    pour = None
     if file.pour:
-        require_bench(laboratory, root.at("pour"), report)
+        require_bench(laboratory, root.at("pour"), builder.report)
         vessels = builder.pourer(None, root), builder.receiver(None, root)
         pour = builder.scene("pour", *vessels, (), (), root)
-    memory = None
-    in_force = default if parameters is None else default | parameters.in_force()
-    if file.prior is not None and laboratory is not None and not report.problems:
-        memory = _memory(
-            file, parameters, calibration, deployment, laboratory, root.at("prior"), references, posteriors
-        )
-    if file.calibration is not None and calibration is not None:
-        design, simulations = file.calibration.pours.designed(memory)
-        calibration = replace(calibration, memory=memory, design=design, design_simulations=simulations)
-    elif memory is not None and deployment is not None:
-        deployment, in_force = replace(deployment, memory=memory), in_force | memory.means
-    if calibration is not None and calibration.records is None:
-        limits = _arm_limits(calibration.actions, laboratory)
-        calibration = replace(calibration, constraints=(*calibration.constraints, *limits))
-    if deployment is not None:
-        limits = _arm_limits(deployment.actions, laboratory)
-        deployment = replace(deployment, constraints=(*deployment.constraints, *limits))
-    broken = any(report.is_broken(root.at(key)) for key in ("calibration", "deployment"))
+    return _Sections(calibration, deployment, dispense, mixtures, pour)
+
+
+def _check_actions(file: CampaignFile, builder: SceneBuilder, root: Place) -> None:
+    """Check that the campaign's actions have no prior that nothing averages over."""
+    broken = any(builder.report.is_broken(root.at(key)) for key in ("calibration", "deployment"))
     if not broken and (file.calibration is None or file.calibration.actions is not None):
         builder.refuse_prior(file.actions, root, "decides nothing: no calibration takes its actions from here")
-    if file.on_unknown == "repeat" and laboratory is not None and not _is_virtual(laboratory):
-        report.add(
-            root.at("on_unknown"),
-            f"'repeat' needs a virtual bench, and laboratory '{laboratory.name}' has none; use 'ask'",
-        )
-    elif file.on_unknown == "repeat" and laboratory is not None and laboratory.places and dispense is not None:
-        text = (
-            f"'repeat' would dose twice: the vessels of laboratory '{laboratory.name}' keep what is in them; use 'ask'"
-        )
-        report.add(root.at("on_unknown"), text)
-    if file.unattended is not None and laboratory is not None:
-        if not (laboratory.places and laboratory.safeguard):
-            missing = "'safeguard'" if laboratory.places else "'gripper' and 'places'"
-            text = f"pours without a person need {missing} in the file of laboratory '{laboratory.name}'"
-            report.add(root.at("unattended"), text)
+
+
+def _check_repeating(
+    file: CampaignFile, sections: _Sections, laboratory: LaboratorySettings, at: Place, report: Report
+) -> None:
+    """Check that a pour with unknown outcome may be repeated, if the file requests it."""
+    if file.on_unknown != "repeat":
+        return
+    if laboratory.mode != "virtual" or not laboratory.pours:
+        report.add(at, f"'repeat' needs a virtual bench, and laboratory '{laboratory.name}' has none; use 'ask'")
+    elif laboratory.places and sections.dispense is not None:
+        kept = f"the vessels of laboratory '{laboratory.name}' keep what is in them"
+        report.add(at, f"'repeat' would dose twice: {kept}; use 'ask'")
+
+
+def _check_unattended(file: CampaignFile, laboratory: LaboratorySettings, at: Place, report: Report) -> None:
+    """Check that the laboratory can pour without a person, if the file requests it."""
+    if file.unattended is None or (laboratory.places and laboratory.safeguard):
+        return
+    missing = "'safeguard'" if laboratory.places else "'gripper' and 'places'"
+    report.add(at, f"pours without a person need {missing} in the file of laboratory '{laboratory.name}'")
+
+
+def _campaign_plan(
+    file: CampaignFile,
+    sections: _Sections,
+    laboratory: LaboratorySettings,
+    memory: CampaignMemory | None,
+    root: Place,
+    references: References,
+) -> CampaignPlan:
+    """The plan of a campaign without problems."""
+    dispense, parameters = sections.dispense, file.simulator.parameters
+    if file.unattended is not None:
         laboratory = laboratory.with_values(unattended=file.unattended)
-    if report.problems or laboratory is None:
-        return None
     if dispense is not None:
         laboratory = laboratory.in_real_time()
         if laboratory.places:
             laboratory = laboratory.with_values(vessels=cell_vessels(dispense))
+    in_force = SimulationParameters().model_dump() | ({} if parameters is None else parameters.in_force())
     directory = file.outputs.folder if file.outputs.directory is None else root.directory / file.outputs.directory
     outputs = file.outputs.model_copy(update={"directory": str(resolved(directory))})
     record: dict[str, Any] = {"outputs": outputs} | ({} if memory is None else {"prior": ResolvedPrior.of(memory)})
-    record |= {} if mixtures is None else {"mixtures": mixtures}
+    record |= {} if sections.mixtures is None else {"mixtures": sections.mixtures}
     return CampaignPlan(
         name=file.name,
         seed=file.seed,
         source=root.document.path,
         laboratory=laboratory,
-        parameters=SimulationParameters.from_values(in_force),
-        calibration=calibration,
-        deployment=deployment,
+        parameters=SimulationParameters.from_values({**in_force, **sections.prior_means}),
+        calibration=sections.calibration,
+        deployment=sections.deployment,
         outputs=outputs,
         parallel_simulations=file.parallel_simulations,
         on_unknown=file.on_unknown,
         resolved=as_file(file.model_copy(update=record), root, references),
         laboratory_source=(resolved(root.directory / file.laboratory) if isinstance(file.laboratory, str) else None),
         dispense=dispense,
-        pour=pour,
+        pour=sections.pour,
     )
 
 
@@ -401,15 +466,14 @@ def _arm_limits(actions: Space, laboratory: LaboratorySettings | None) -> tuple[
 
 def _memory(
     file: CampaignFile,
-    parameters: ParametersBase | None,
-    calibration: CalibrationPlan | None,
-    deployment: DeploymentPlan | None,
+    sections: _Sections,
     laboratory: LaboratorySettings,
     place: Place,
     references: References,
     posteriors: Callable[[], PosteriorSource],
 ) -> CampaignMemory | None:
     """The prior of a campaign from earlier ones; None after a problem."""
+    calibration, deployment = sections.calibration, sections.deployment
     report, infos = references.report, SimulationParameters.info()
     if calibration is not None and not calibration.settings.makes_posterior:
         report.add(place, f"belongs to C4; {calibration.strategy} takes all values for alike", key=True)
@@ -425,6 +489,7 @@ def _memory(
             poured=poured,
         )
     elif deployment is not None and deployment.settings.simulates:
+        parameters: ParametersBase | None = file.simulator.parameters
         fixed = {} if parameters is None else parameters.fixed()
         needs = PriorNeeds(
             scene=deployment.scenes[0],
@@ -440,7 +505,3 @@ def _memory(
         return None
 
     return resolve_prior(file.prior, needs, place, references, posteriors)
-
-
-def _is_virtual(laboratory: LaboratorySettings) -> bool:
-    return laboratory.mode == "virtual" and laboratory.pours

@@ -23,11 +23,9 @@ from orchestrator.cli.command_options import (
 )
 from orchestrator.cli.console import (
     RefusalError,
-    Refused,
     check_output,
     print_message,
     print_note,
-    print_warning,
 )
 
 if TYPE_CHECKING:
@@ -133,17 +131,10 @@ def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | No
     """
     from actors.interfaces import InvalidActionError
     from actors.places import all_places
-    from orchestrator.campaigns.action_assignments import assigned_action
-    from orchestrator.campaigns.campaign_checks import check_action, check_vessels
-    from orchestrator.cli.simulate_command import scene_to_simulate, wanted_in
+    from orchestrator.campaigns.campaign_checks import check_action
+    from orchestrator.cli.simulate_command import scene_and_action
 
-    scene, space = scene_to_simulate(plan, scene_name)
-    with Refused(ValueError, at="--set: "):
-        action = assigned_action(assignments, fixed=scene.fixed, space=space)
-    wanted = wanted_in(plan, scene, scene_name)
-    problems = check_vessels(scene, plan.source, wanted, warn=print_warning)
-    if problems:
-        raise RefusalError("\n".join(map(str, problems)))
+    scene, action = scene_and_action(plan, assignments, scene_name)
     if not plan.laboratory.pours:
         raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans")
     try:

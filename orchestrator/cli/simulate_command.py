@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from sim_engine.scene import PourTask, Scene
     from sim_engine.search_space import Space
     from sim_engine.simulator import PourSimulator
+    from sim_engine.vessel.shapes import VesselSpec
 
 
 def simulate(
@@ -62,8 +63,6 @@ def simulate(
     the first seed, as are the recording and the picture. 'prediction' contains means and standard deviations of all
     seeds, and the interval that should contain nine pours in ten.
     """
-    from orchestrator.campaigns.action_assignments import assigned_action
-    from orchestrator.campaigns.campaign_checks import check_vessels
     from orchestrator.campaigns.file_loading import load_discrepancy, load_parameters, load_vessel
     from orchestrator.cli.foreground_run import read_campaign, read_draws
     from sim_engine.prediction_band import band_of, spreads
@@ -74,19 +73,11 @@ def simulate(
     inputs = PredictionInputs(plan.parameters)
     if parameters is not None:
         inputs = PredictionInputs(load_parameters(parameters, plan.parameters), draws, load_discrepancy(parameters))
-    vessel = None if receiver is None else load_vessel(receiver)
-    scene, space = scene_to_simulate(plan, scene_name)
-    if vessel is not None:
-        scene = dataclasses.replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)
-    with Refused(ValueError, at="--set: "):
-        action = assigned_action(assignments or [], fixed=scene.fixed, space=space)
-    inputs = inputs.at(scene)
     check_output(rrd, "--rrd", ".rrd")
     check_output(png, "--png", ".png")
-    wanted = wanted_in(plan, scene, scene_name)
-    problems = check_vessels(scene, plan.source, wanted, warn=print_warning)
-    if problems:
-        raise RefusalError("\n".join(map(str, problems)))
+    vessel = None if receiver is None else load_vessel(receiver)
+    scene, action = scene_and_action(plan, assignments or [], scene_name, vessel)
+    inputs = inputs.at(scene)
     frame_rate = 20.0 if rrd or png else 0.0
     tasks = inputs.tasks(scene, action, seed, seeds, frame_rate)
     simulator = PourSimulator()
@@ -131,17 +122,34 @@ def simulate(
         raise RefusalError("\n".join(bad), FAILED)
 
 
-def wanted_in(plan: CampaignPlan, scene: Scene, name: str | None) -> float | None:
-    """Return the volume that a scene's receiver must hold if less than the load is requested [m³]; None for all of it.
+def scene_and_action(
+    plan: CampaignPlan, assignments: list[str], scene_name: str | None = None, receiver: VesselSpec | None = None
+) -> tuple[Scene, Action]:
+    """Return the scene and the action that the options of a command select, with vessels that hold the liquid.
 
     Args:
         plan: the campaign.
-        scene: a scene from `scene_to_simulate`, perhaps with another receiver.
-        name: name that was passed to `scene_to_simulate`.
+        assignments: `name=value` texts.
+        scene_name: see `scene_to_simulate`.
+        receiver: instead of the scene's.
+
+    Raises:
+        RefusalError: the scene, a value or a vessel is invalid.
     """
-    if plan.deployment is None or name in ("calibration", "transfer"):
-        return None
-    return plan.deployment.wanted(scene)
+    from orchestrator.campaigns.action_assignments import assigned_action
+    from orchestrator.campaigns.campaign_checks import check_vessels
+
+    scene, space = scene_to_simulate(plan, scene_name)
+    if receiver is not None:
+        scene = dataclasses.replace(scene, name=f"{scene.pourer.name} into {receiver.name}", receiver=receiver)
+    with Refused(ValueError, at="--set: "):
+        action = assigned_action(assignments, fixed=scene.fixed, space=space)
+    deployed = plan.deployment is not None and scene_name not in ("calibration", "transfer")
+    volume = plan.deployment.wanted(scene) if deployed and plan.deployment is not None else None
+    problems = check_vessels(scene, plan.source, volume, warn=print_warning)
+    if problems:
+        raise RefusalError("\n".join(map(str, problems)))
+    return scene, action
 
 
 def _simulated_pour(simulator: PourSimulator, tasks: list[PourTask]) -> list[SimulatedPour]:

@@ -36,7 +36,7 @@ from orchestrator.learning.requests import (
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.learning.strategy import Progress
 from orchestrator.records.codec import Results, result_of
-from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader
 from orchestrator.records.run_record import CampaignResult
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import StageDefinition
@@ -47,6 +47,7 @@ from sim_engine.scene import PourTask, Scene
 from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.shapes import cylinder
 from tests.support import plans
+from tests.support.command_process import logical
 
 SPACE = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset", 0.08, 0.15)))
 SCENE = Scene(
@@ -306,30 +307,10 @@ async def run_toy(directory: Path, laboratory: ToyLaboratory | None = None, **ar
     return await run_campaign(plan, laboratory or ToyLaboratory(), directory, **arguments)
 
 
-TIMING = ("cpu_s", "seconds")
-
-
 def logical_record(directory: Path) -> list[tuple[Any, ...]]:
     """What a run asked for and was told, in order; times, process ids and attempts aside."""
-    record: list[tuple[Any, ...]] = []
-    outcomes: dict[int, Any] = {}
     with JournalReader(directory / JOURNAL_NAME) as journal:
-        for entry in journal.entries():
-            body = entry.body
-            match entry.kind:
-                case Kind.FINISHED | Kind.POUR_FINISHED:
-                    outcomes[body["id"]] = _timeless(body["outcome"])
-                case Kind.ASKED | Kind.REQUESTED | Kind.STAGE_OPENED | Kind.STAGE_CLOSED | Kind.DECISION:
-                    record.append((entry.stage, entry.kind, body))
-                case Kind.TOLD:
-                    record.append((entry.stage, entry.kind, body["id"], outcomes[body["id"]]))
-    return record
-
-
-def _timeless(data: Any) -> Any:
-    if isinstance(data, dict):
-        return {key: _timeless(value) for key, value in data.items() if key not in TIMING}
-    return [_timeless(value) for value in data] if isinstance(data, list) else data
+        return logical(list(journal.entries()))
 
 
 def answering(answer: str) -> Callable[[str, Sequence[str]], str | Awaitable[str]]:

@@ -285,41 +285,51 @@ def _check_receivers(section: NotifySettings, at: Place, report: Report) -> None
             report.add(at.at("to", i), problem)
 
 
-def _resolve(file: DaemonFile, place: Place, report: Report) -> DaemonSettings:
-    def path(text: str | None, at: Place) -> Path | None:
-        return None if text is None else resolved(at.directory / text)
-
-    rigs = []
+def _rigs(file: DaemonFile, place: Place, report: Report) -> list[Rig]:
+    """The rigs of a daemon's file; problems with their laboratories are added to the report."""
+    rigs: list[Rig] = []
     for name, text in (file.rigs or {}).items():
-        at = place.at("rigs", name)
-        source = resolved(place.directory / text)
+        at, source = place.at("rigs", name), resolved(place.directory / text)
         if name == NO_RIG:
             report.add(at, f"'{NO_RIG}' stands for campaigns that pour nothing; give the rig another name", key=True)
         elif (missing := missing_file(source)) is not None:
             report.add(at, missing)
         else:
             rigs += _rig(name, source, at, report)
-    roots = []
-    for index, text in enumerate(file.roots or ()):
-        root = resolved(place.directory / text)
-        roots.append(root)
-        if not root.is_dir():
-            report.add(place.at("roots", index), f"{root} is not a folder")
-    listen = place.at("listen")
+    return rigs
+
+
+def _check_listening(
+    file: DaemonFile, certificate: Path | None, key: Path | None, listen: Place, report: Report
+) -> None:
+    """Check the files of TLS, and that no token crosses a network in plain text."""
     tls = file.listen.tls
-    files = (None, None) if tls is None else (path(tls.certificate, listen), path(tls.key, listen))
-    if tls is not None:
-        for key, pem in zip(("certificate", "key"), files, strict=True):
-            if pem is not None and (missing := missing_file(pem)) is not None:
-                report.add(listen.at("tls", key), missing)
-        if not any(report.is_broken(listen.at("tls", key)) for key in ("certificate", "key")) and None not in files:
-            _check_tls(*files, listen.at("tls"), report)
+    for name, pem in (("certificate", certificate), ("key", key)):
+        if pem is not None and (missing := missing_file(pem)) is not None:
+            report.add(listen.at("tls", name), missing)
+    broken = any(report.is_broken(listen.at("tls", name)) for name in ("certificate", "key"))
+    if certificate is not None and key is not None and not broken:
+        _check_tls(certificate, key, listen.at("tls"), report)
     if file.listen.host not in LOOPBACK and tls is None and not file.listen.plain:
         report.add(
             listen.at("host"),
             "other machines reach this address, and tokens would cross the network in plain text; add 'tls', or "
             "'plain: true' where something in front of it encrypts",
         )
+
+
+def _resolve(file: DaemonFile, place: Place, report: Report) -> DaemonSettings:
+    def path(text: str | None, at: Place) -> Path | None:
+        return None if text is None else resolved(at.directory / text)
+
+    rigs = _rigs(file, place, report)
+    roots = tuple(resolved(place.directory / text) for text in file.roots or ())
+    for index, root in enumerate(roots):
+        if not root.is_dir():
+            report.add(place.at("roots", index), f"{root} is not a folder")
+    listen, tls = place.at("listen"), file.listen.tls
+    certificate, key = (None, None) if tls is None else (path(tls.certificate, listen), path(tls.key, listen))
+    _check_listening(file, certificate, key, listen, report)
     if file.madsci is not None:
         try:
             networks(file.madsci.allow or ())
@@ -339,10 +349,10 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> DaemonSettings:
         host=file.listen.host,
         port=file.listen.port,
         names=tuple(file.listen.names or ()),
-        certificate=files[0],
-        key=files[1],
+        certificate=certificate,
+        key=key,
         rigs=tuple(rigs) or (Rig(ANY_RIG),),
-        roots=tuple(roots),
+        roots=roots,
         simulators=file.simulators,
         ray=None if file.ray is None or report.problems else RaySettings(address=file.ray.address),
         in_process=file.in_process,
