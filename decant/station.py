@@ -93,10 +93,16 @@ class StationPour:
         """The pour as a row of `Station.pours`."""
         low, high = self.expected_g or (None, None)
         return {
-            **{"id": self.id, "state": self.state, "source": self.details["source"]},
-            **{"receiver": self.details["receiver"], "amount_g": self.details["amount_g"]},
-            **{"expected_low_g": low, "expected_high_g": high, "received_g": self.received_g},
-            **{"spilled_g": self.spilled_g, "error_g": self.error_g},
+            "id": self.id,
+            "state": self.state,
+            "source": self.details["source"],
+            "receiver": self.details["receiver"],
+            "amount_g": self.details["amount_g"],
+            "expected_low_g": low,
+            "expected_high_g": high,
+            "received_g": self.received_g,
+            "spilled_g": self.spilled_g,
+            "error_g": self.error_g,
             "duration_s": self._of("result", "duration_s"),
             "run": self.details["run"],
         }

@@ -409,8 +409,11 @@ class LogLine(Event):
 
 _CLASSES: dict[str, type[Event]] = {
     **{kind.KIND: kind for kind in (*Event.__subclasses__(), *JournalEvent.__subclasses__()) if kind.KIND is not None},
-    **{Kind.STARTED: RequestStarted, Kind.POUR_STARTED: RequestStarted, Kind.NOTE: LogLine},
-    **{Kind.FINISHED: RequestFinished, Kind.POUR_FINISHED: RequestFinished},
+    Kind.STARTED: RequestStarted,
+    Kind.POUR_STARTED: RequestStarted,
+    Kind.NOTE: LogLine,
+    Kind.FINISHED: RequestFinished,
+    Kind.POUR_FINISHED: RequestFinished,
 }
 
 _LATE: dict[str, Callable[[Any], Any]] = {

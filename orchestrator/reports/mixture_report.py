@@ -40,8 +40,13 @@ COLOURS = (style.POURER, style.PREDICTED, style.GOOD, style.POSTERIOR, style.FAL
 """Of the liquids, in the order of the campaign's table."""
 
 STATES: dict[CupState, str] = {
-    **{"waiting": "empty", "filling": "being filled", "full": "done", "missed": "missed"},
-    **{"rejected": "rejected", "refused": "not poured", "unknown": "UNKNOWN"},
+    "waiting": "empty",
+    "filling": "being filled",
+    "full": "done",
+    "missed": "missed",
+    "rejected": "rejected",
+    "refused": "not poured",
+    "unknown": "UNKNOWN",
 }
 
 PROBLEMS = ("missed", "missed, corrected", "rejected", "not poured", "UNKNOWN")

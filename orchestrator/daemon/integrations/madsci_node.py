@@ -140,8 +140,8 @@ class MadsciNode:
              "get_action_history", "send_admin_commands", "get_log"), True,
         )  # fmt: skip
         return {
-            **{"node_name": self._name, "node_id": key, "node_type": "device", "module_name": "decant"},
-            **{"module_version": _semantic(importlib.metadata.version(DISTRIBUTION)), "config": {}},
+            "node_name": self._name, "node_id": key, "node_type": "device", "module_name": "decant",
+            "module_version": _semantic(importlib.metadata.version(DISTRIBUTION)), "config": {},
             "node_description": "A robot arm that pours liquids and weighs them.",
             "capabilities": {
                 **able, "set_config": False, "action_files": False, "get_resources": False,
@@ -417,7 +417,11 @@ def _definition(name: str, description: str, arguments: dict[str, tuple[str, boo
 
 def _result(action: NodeAction, status: str, value: Any = None, error: str = "") -> dict[str, Any]:
     return {
-        **{"action_id": action.id, "status": status, "json_result": value, "files": None, "datapoints": None},
+        "action_id": action.id,
+        "status": status,
+        "json_result": value,
+        "files": None,
+        "datapoints": None,
         "errors": [_error(error)] if error else [],
     }
 

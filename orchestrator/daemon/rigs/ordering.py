@@ -195,11 +195,21 @@ class Ordering:
         sure = (held.mass or 0.0) - SURE * held.deviation - self.materials.promised(order.source)
         room = self.materials.vessel(order.receiver).capacity - (target.mass or 0.0) / density
         return {
-            **{"id": order.id, "campaign": "", "state": "dry run", "reason": "nothing was poured"},
-            **{"needs_enabling": False, "source": order.source, "receiver": order.receiver},
-            **{"amount_g": _grams(order.amount), "order": request.model_dump(), "predicted": predicted, "result": None},
+            "id": order.id,
+            "campaign": "",
+            "state": "dry run",
+            "reason": "nothing was poured",
+            "needs_enabling": False,
+            "source": order.source,
+            "receiver": order.receiver,
+            "amount_g": _grams(order.amount),
+            "order": request.model_dump(),
+            "predicted": predicted,
+            "result": None,
             "limits": {"available_g": 1e3 * max(sure, 0.0), "room_ml": 1e6 * max(room, 0.0)},
-            **{"run": None, "created": None, "ended": None},
+            "run": None,
+            "created": None,
+            "ended": None,
         }
 
     async def _forget(self, item: QueueItem) -> None:
@@ -217,11 +227,20 @@ class Ordering:
         row = self.book.find(key) or row
         progress = self._daemon.progress(item)
         return {
-            **{"id": key, "campaign": item.id, "state": state, "reason": reason},
+            "id": key,
+            "campaign": item.id,
+            "state": state,
+            "reason": reason,
             "needs_enabling": item.mode == "hardware" and not item.motion_enabled and state in ("queued", "paused"),
-            **{"source": row["source"], "receiver": row["receiver"], "amount_g": _grams(row["amount"])},
-            **{"order": row["body"], "predicted": row["predicted"], "result": row["result"], "run": item.run},
-            **{"created": item.created, "ended": item.ended},
+            "source": row["source"],
+            "receiver": row["receiver"],
+            "amount_g": _grams(row["amount"]),
+            "order": row["body"],
+            "predicted": row["predicted"],
+            "result": row["result"],
+            "run": item.run,
+            "created": item.created,
+            "ended": item.ended,
             "seconds_left": None if progress is None else progress["seconds_left"],
         }
 
