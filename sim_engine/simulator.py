@@ -374,16 +374,20 @@ def calm_until(motion: Motion, pourer: Vessel, volume: float) -> float:
     return float(begin * STEP) if height <= CALM * pourer.opening_radius else 0.0
 
 
+def is_near_lip(pourer: Vessel, volume: float, tilt: float) -> bool:
+    """Whether the level is so near below the lip at a tilt [rad] that a wave may pass it; see `FREEBOARD`."""
+    return level(pourer, volume, tilt) > -FREEBOARD * pourer.opening_radius
+
+
 def _last_below(pourer: Vessel, volume: float, tilts: Floats) -> int:
     """Index up to which the level stays below the lip by the freeboard: bisection over the first rise of the tilt."""
-    limit = -FREEBOARD * pourer.opening_radius
     falls = np.append((np.maximum.accumulate(tilts) - tilts > FALL)[1:], True)
     low, high = 0, int(np.argmax(falls))
-    if level(pourer, volume, float(tilts[0])) > limit:
+    if is_near_lip(pourer, volume, float(tilts[0])):
         return 0
     while high - low > 1:
         middle = (low + high) // 2
-        if level(pourer, volume, float(tilts[middle])) > limit:
+        if is_near_lip(pourer, volume, float(tilts[middle])):
             high = middle
         else:
             low = middle
@@ -513,7 +517,7 @@ class PourSimulator:
         begun = time.process_time()
         start = calm_until(motion, self.vessel(task.scene.pourer), task.scene.liquid.volume)
         mirrored = self.mirrors(task, motion)
-        fluid.load([self._setup(task, motion, start, mirrored)])
+        fluid.load([self.setup(task, motion, start, mirrored)])
         loading = time.process_time() - begun
         course = TimeLoop(task, motion, start, mirrored, dribbling=self._dribbling(task, motion))
         follow(fluid, course, cancelled)
@@ -555,7 +559,7 @@ class PourSimulator:
         )
         return course if course is not None and course.dribbles.any() else None
 
-    def _laid(self, task: PourTask, motion: Motion, at: float, mirrored: bool) -> NDArray[np.float32]:
+    def laid(self, task: PourTask, motion: Motion, at: float, mirrored: bool) -> NDArray[np.float32]:
         """Simulated particles at rest in the pourer in its pose at a time [s], (N, 3) in the world [m]."""
         # The lattice is laid into the upright cup; a tilt error of the grip then moves cup and liquid together.
         tilt = float(motion.tilt(np.array([at]))[0]) if at > 0.0 else 0.0
@@ -572,10 +576,20 @@ class PourSimulator:
         task, motion = course.task, course.motion
         homes = np.full(course.particles, int(ParticleState.IN_POURER), np.uint8)
         times = np.arange(0.0, course.start - 0.5 / task.frame_rate, 1.0 / task.frame_rate)
-        return [(float(t), self._laid(task, motion, float(t), course.mirrored), homes) for t in times]
+        return [(float(t), self.laid(task, motion, float(t), course.mirrored), homes) for t in times]
 
-    def _setup(self, task: PourTask, motion: Motion, start: float, mirrored: bool) -> SceneSetup:
-        """The scene for the engine, from the time at which its simulation begins [s]."""
+    def setup(
+        self, task: PourTask, motion: Motion, start: float, mirrored: bool, longest: float | None = None
+    ) -> SceneSetup:
+        """The scene for the engine.
+
+        Args:
+            task: of the pour.
+            motion: of the pourer.
+            start: time at which the simulation begins [s].
+            mirrored: whether only the half y ≥ 0 is simulated.
+            longest: end of the table of poses [s]; None: that of the motion.
+        """
         from sim_engine.fluid.state import SUPPORT
 
         scene, parameters, error = task.scene, task.parameters, task.placement
@@ -583,8 +597,9 @@ class PourSimulator:
         pourer, receiver = self.vessel(scene.pourer), self.vessel(scene.receiver)
         d = spacing(liquid.volume, parameters.particles)
         drift = liquid_velocity(motion, pourer, start) if start > 0.0 else np.zeros(3)
+        end = motion.duration if longest is None else longest
         return SceneSetup(
-            positions=self._laid(task, motion, start, mirrored),
+            positions=self.laid(task, motion, start, mirrored),
             spacing=d,
             density=liquid.density,
             parameters=parameters,
@@ -592,7 +607,7 @@ class PourSimulator:
             receiver=self._walls(scene.receiver, SUPPORT * d),
             receiver_at=np.array([error.x, error.y, error.z]),
             spill_level=receiver.rim_height + error.z - d,
-            poses=motion.sample(np.arange(0.0, motion.duration + LONGEST_TAIL + 0.1, POSE_STEP)),
+            poses=motion.sample(np.arange(0.0, end + LONGEST_TAIL + 0.1, POSE_STEP)),
             settling=SETTLING,
             start=start,
             drift=(float(drift[0]), float(drift[1]), float(drift[2])),

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -239,6 +239,24 @@ class _Filter:
         return self.value
 
 
+class PouredLiquid(Protocol):
+    """Liquid that leaves the cup of a bench and lands; see `LivePour`."""
+
+    received: float
+    spilled: float
+    flow: float
+    first_flow: float
+    last_flow: float
+
+    def step(self, tilt: float, turned: float, *, missed: bool = False) -> float:
+        """Pour for one step of `TIME_STEP`. Returns the load on the balance, without the receiver [kg]."""
+        ...
+
+    def at_rest(self) -> float:
+        """Mass in the receiver when everything has landed [kg]."""
+        ...
+
+
 class VirtualDosingBench:
     """One source vessel, one balance and one arm over a series of doses.
 
@@ -253,6 +271,7 @@ class VirtualDosingBench:
         dose_seed: of all that differs between doses; None: of the whole series, as `seed`.
         wetness: of the lip at first, 0 … 1.
         held_tilt: by which the cup is held more tilted than the arm reports, besides what is drawn [rad].
+        poured: makes the liquid of each dose; None: `LivePour`.
 
     Attributes:
         volume: in the source [m³].
@@ -273,8 +292,10 @@ class VirtualDosingBench:
         dose_seed: int | None = None,
         wetness: float = 0.0,
         held_tilt: float = 0.0,
+        poured: Callable[[VirtualDosingBench], PouredLiquid] | None = None,
     ) -> None:
         self.cup, self.liquid, self.scale = cup, liquid, scale
+        self._poured = poured
         self.receiver_mass, self.fall_height = receiver_mass, fall_height
         self._interval = command_interval
         self._level, self._flow_table = _tables_of(cup)
@@ -355,7 +376,7 @@ class VirtualDosingBench:
         signals: list[tuple[float, float, float, float]] = []
         delivered: list[DoseReading] = []
         normals = rng.standard_normal(int(LONGEST_DOSE / dt) * 2 + 20).tolist()
-        pour = LivePour(self, drops, normals)
+        pour: PouredLiquid = LivePour(self, drops, normals) if self._poured is None else self._poured(self)
         limit, acceleration = math.radians(90.0), math.radians(600.0)
         k, time = 0, 0.0
         while time < LONGEST_DOSE and time < finished_at + 2.5:

@@ -41,8 +41,9 @@ class FluidEngine:
         self.pool, self.most_scenes = POOL, MOST_SCENES
         self.state = FluidState(self.most_scenes, self.pool)
         self.stepper = Stepper(self.state)
-        self.scenes = 0
+        self.scenes = self.loads = 0
         self._tables, self._cavities = np.zeros(1, np.float32), np.zeros(1, np.uint8)
+        self._pose_tables: list[tuple[int, int]] = []
         self._thick: list[bool] = []
         self._ranges: list[tuple[int, int]] = []
         self._facts = np.zeros((0, STATES + len(FACTS)))
@@ -104,6 +105,10 @@ class FluidEngine:
             )
             begin += blocks[s]
         self._tables, self._cavities = tables.array(), insides.array()
+        self._pose_tables = [
+            (int(np.asarray(row["poses_begin"])), len(setup.poses)) for row, setup in zip(scenes, setups, strict=True)
+        ]
+        self.loads += 1
         self.scenes = len(setups)
         begins = np.cumsum([0, *blocks])
         self._ranges = [(int(first), len(setup.positions)) for first, setup in zip(begins, setups, strict=False)]
@@ -164,6 +169,19 @@ class FluidEngine:
         while self._fact("open", scene):
             self.stepper.cohere(scene, scene + 1)
             self.stepper.advance(scene, until, self._tables, self._cavities, self._facts, self._thick[scene])
+
+    def follow(self, first: int, poses: NDArray[np.float64], scene: int = 0) -> None:
+        """Replace rows of a scene's table of poses, from one that the scene has not reached; the last one goes on.
+
+        Args:
+            first: row, of time `first` · `POSE_STEP`.
+            poses: (T, 7), see `SceneSetup`.
+            scene: its index.
+        """
+        begin, rows = self._pose_tables[scene]
+        table = self._tables[begin : begin + 7 * rows].reshape(rows, 7)
+        table[first : first + len(poses)] = poses
+        table[first + len(poses) :] = poses[-1]
 
     def census(self, scene: int = 0) -> NDArray[np.int32]:
         """Particles in each `ParticleState`, shape (5,)."""

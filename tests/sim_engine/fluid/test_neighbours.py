@@ -38,7 +38,7 @@ def test_half_of_a_symmetric_liquid_moves_as_it_does_beside_the_other_half(
     halves of the whole liquid differ by as much, by rounding."""
     liquid = SCENE.liquid.model_copy(update={"dynamic_viscosity": viscosity} if viscosity else {})
     task = PourTask(replace(SCENE, liquid=liquid), FAST, SimulationParameters(particles=600, cohesion=cohesion), 1)
-    half = replace(simulator._setup(task, simulator.prepare(task), 0.0, True), apart=0.0, settling=0.0, gravity=0.0)
+    half = replace(simulator.setup(task, simulator.prepare(task), 0.0, True), apart=0.0, settling=0.0, gravity=0.0)
     whole = replace(half, positions=np.concatenate([half.positions, half.positions * MIRROR]), mirrored=False)
     fluid, n = engine(), len(half.positions)
     fluid.load([half, whole])
@@ -105,7 +105,7 @@ def test_a_scene_gives_beside_another_one_what_it_gives_alone(simulator: PourSim
     """Their vessels, poses and cavities differ, and lie one after another in the same tables."""
     other = replace(SCENE, pourer=cylinder("flask", inner_radius=0.04, inner_height=0.12))
     tasks = [PourTask(scene, FAST, SimulationParameters(particles=200), 1) for scene in (SCENE, other)]
-    setups = [simulator._setup(task, simulator.prepare(task), 0.0, False) for task in tasks]
+    setups = [simulator.setup(task, simulator.prepare(task), 0.0, False) for task in tasks]
     fluid, alone = engine(), []
     for setup in setups:
         fluid.load([setup])
