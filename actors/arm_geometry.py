@@ -20,6 +20,7 @@ Frames:
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Annotated, Self
 
@@ -166,6 +167,11 @@ class Box(Settings):
 
     high: Annotated[Point, Example("{x: 1000 mm, y: 500 mm, z: 800 mm}")]
     """Corner with the largest x, y and z."""
+
+    @property
+    def corners(self) -> list[tuple[float, ...]]:
+        """All eight corners [m]."""
+        return list(itertools.product(*zip(self.low.vector, self.high.vector, strict=True)))
 
 
 class Plane(Settings):

@@ -9,17 +9,16 @@ from __future__ import annotations
 import ipaddress
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from actors.arm.arm_interface import ArmFigure, PlannedPour
 from actors.arm.arm_settings import ArmDiagnostics, ArmEmulator, ArmKind
-from actors.arm.planned_pour import MotionPath, PlaceWay, PourPath
+from actors.arm.joint_arm_kind import JointArmKind
+from actors.arm.planned_pour import MotionPath
 from actors.arm.simulated_arm import APPROACH_TIME, SimulatedArm, SimulatedArmSettings
 from actors.arm.ur.robot_models import MODELS, same_robot
 from actors.arm.ur_settings import UrArmSettings
-from actors.arm_geometry import Point, RobotCell
+from actors.arm_geometry import RobotCell
 from actors.balance.balance_settings import BalanceEmulator, BalanceKind, SerialBalanceSettings
 from actors.balance.serial_port import look_at_port
 from actors.balance.simulated_balance import SimulatedBalanceSettings, VirtualBalance
@@ -27,12 +26,10 @@ from actors.grippers.gripper_interface import GripperEmulator
 from actors.grippers.onrobot_gripper import OnRobotSettings
 from actors.grippers.robotiq_gripper import RobotiqSettings
 from actors.interfaces import DeviceCheck, LaboratoryError
-from actors.places import PlaceSettings
 from sim_engine.action import Action
 from sim_engine.scene import Scene
 from sim_engine.settings.model import Problems
 from sim_engine.settings.plugin_registry import own_extras
-from sim_engine.vessel.vessel import Vessel
 
 
 def _emulator(name: str) -> Any:
@@ -68,16 +65,16 @@ class SimulatedArmKind(ArmKind[SimulatedArmSettings]):
 
     def plan(self, scene: Scene, action: Action) -> MotionPath:
         """See `ArmKind.plan`."""
-        from actors.bench.pour_feasibility import plan_pour
+        from actors.arm.pour_feasibility import plan_pour
 
         return MotionPath(plan_pour(scene, action), approach_time=APPROACH_TIME)
 
 
-class UrArmKind(ArmKind[UrArmSettings]):
+class UrArmKind(JointArmKind[UrArmSettings]):
     """A UR arm."""
 
     settings = UrArmSettings
-    doses = carries = emulated = True
+    doses = emulated = True
 
     def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
         """See `ArmKind.check_laboratory`."""
@@ -89,18 +86,7 @@ class UrArmKind(ArmKind[UrArmSettings]):
                 arm.add(f"a {spec.model} answers at most {fastest} times a second; write '{fastest} Hz'", "rate")
         if arm.valid("model", "payload") and spec.payload > (most := MODELS[spec.model].payload):
             arm.add(f"a {spec.model} carries at most {most:g} kg", "payload")
-        if cell is None:
-            if problems.valid("cell"):
-                problems.add(
-                    "an arm needs to know what stands where; add 'cell: {receiver: …, direction: …}' beside it", "arm"
-                )
-        elif problems.valid("arm", "cell"):
-            from actors.arm.planning.path_checks import check_limits
-
-            for problem in check_limits(spec.with_values(cell=cell)):
-                key, _, text = problem.partition(": ")
-                owner = problems if key.startswith("cell.") else arm
-                owner.add(text, *key.split("."), more=True)
+        super().check_laboratory(problems, mode=mode, cell=cell)
 
     def _check_address(self, problems: Problems, mode: str) -> None:
         if mode != "hardware":
@@ -121,50 +107,6 @@ class UrArmKind(ArmKind[UrArmSettings]):
         from actors.arm.ur.ur_driver import AcceptedArm, UrArm
 
         return (UrArm, (self.spec,)) if accepted is None else (AcceptedArm, (self.spec, accepted))
-
-    def plan(self, scene: Scene, action: Action) -> PourPath:
-        """See `ArmKind.plan`."""
-        from actors.arm.planning.pour_planner import plan_path
-        from actors.bench.pour_feasibility import plan_pour, vessel
-
-        return plan_path(plan_pour(scene, action), self.spec, vessel(scene.pourer), vessel(scene.receiver))
-
-    def place_problems(
-        self, places: Sequence[PlaceSettings], vessels: Mapping[str, Vessel], opened: Mapping[str, float] = {}
-    ) -> Iterable[tuple[int, str]]:
-        """See `ArmKind.place_problems`."""
-        from actors.arm.planning.place_ways import place_problems
-
-        return place_problems(places, self.spec, vessels, opened)
-
-    def way(
-        self,
-        place: PlaceSettings,
-        places: Sequence[PlaceSettings],
-        vessels: Mapping[str, Vessel],
-        volume: float | None = None,
-    ) -> PlaceWay:
-        """See `ArmKind.way`."""
-        from actors.arm.planning.place_ways import way_to
-
-        return way_to(place, places, self.spec, vessels, volume)
-
-    def pouring_at(self, place: PlaceSettings) -> UrArmSettings:
-        """See `ArmKind.pouring_at`."""
-        from actors.arm.planning.place_ways import vessel_at
-
-        x, y, z = map(float, vessel_at(place, self.spec).position)
-        foot = Point(x=x, y=y, z=z)
-        return self.spec.with_values(cell=self.spec.cell.with_values(receiver=foot))
-
-    def in_the_way(
-        self, path: PlannedPour, pourer: Vessel, places: Sequence[PlaceSettings], vessels: Mapping[str, Vessel]
-    ) -> list[str]:
-        """See `ArmKind.in_the_way`."""
-        from actors.arm.planning.place_ways import in_the_way
-
-        assert isinstance(path, PourPath)
-        return in_the_way(path, pourer, places, self.spec, vessels)
 
     def with_stored(self, folder: Path) -> UrArmSettings:
         """See `ArmKind.with_stored`: the calibration of `calibration_file`."""
@@ -192,12 +134,6 @@ class UrArmKind(ArmKind[UrArmSettings]):
         """See `ArmKind.start_emulator`."""
         emulator: ArmEmulator = _emulator("ur")(self.spec)
         return emulator
-
-    def figure(self) -> ArmFigure:
-        """See `ArmKind.figure`."""
-        from actors.arm.appearance import LinkFigure
-
-        return LinkFigure(self.spec)
 
     def diagnostics(self) -> ArmDiagnostics:
         """See `ArmKind.diagnostics`."""

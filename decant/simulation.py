@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from actors.bench.pour_feasibility import path_of, plan_pour
+from actors.arm.pour_feasibility import path_of, plan_pour
 from actors.interfaces import InvalidActionError
 from actors.simulators.background_pool import background_pool
 from decant.run_results import Run

@@ -150,6 +150,9 @@ EXTRAS = {
     "ray": "lab",
     "serial": "lab",
     "psutil": "lab",
+    "pinocchio": "urdf",
+    "franky": "franka",
+    "franky_sim": "franka-sim",
     "rerun": "live",
     "apprise": "daemon",
     "fastapi": "daemon",
@@ -168,6 +171,9 @@ EXTRAS = {
 
 PACKAGES = {
     "serial": "pyserial",
+    "pinocchio": "pin",
+    "franky": "franky-control",
+    "franky_sim": "franky-sim",
     "skimage": "scikit-image",
     "pythonjsonlogger": "python-json-logger",
     "unitelabs": "unitelabs-cdk",

@@ -19,10 +19,10 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LinkFigure:
-    """A figure of a UR arm, drawn from its kinematics.
+    """A figure of an arm with joints, drawn from its kinematics.
 
     Args:
-        spec: of the arm and its cell (`actors.arm.arm_settings.UrArmSettings`).
+        spec: of the arm and its cell (`actors.arm.joint_arm.JointArmSettings`).
     """
 
     spec: Any
@@ -30,22 +30,12 @@ class LinkFigure:
     @property
     def bars(self) -> tuple[Bar, ...]:
         """See `ArmFigure.bars`."""
-        return (
-            Bar("base", 0.075),
-            Bar("shoulder", 0.068),
-            Bar("upper arm", 0.055),
-            Bar("elbow", 0.055),
-            Bar("forearm", 0.045),
-            Bar("wrist 1", 0.043),
-            Bar("wrist 2", 0.043),
-            Bar("wrist 3", 0.04),
-            Bar("gripper", 0.022),
-        )
+        return tuple(Bar(link.name, link.radius) for link in self.spec.kinematics.bars)
 
     @property
     def home(self) -> tuple[float, ...]:
         """See `ArmFigure.home`."""
-        return tuple(self.spec.home.angles)
+        return tuple(self.spec.home_joints)
 
     @property
     def table(self) -> float:
@@ -54,15 +44,14 @@ class LinkFigure:
 
     def ends(self, joints: FloatArray) -> FloatArray:
         """See `ArmFigure.ends`."""
-        from actors.arm.planning.kinematics import cell_transforms, flange_transforms, link_points
+        from actors.arm.planning.kinematics import cell_transforms, flange_transforms
 
-        cell, q = cell_transforms(self.spec), np.asarray(joints, dtype=float)
-        points = cell.base.apply(link_points(q, self.spec.robot))
-        foot = np.broadcast_to(cell.base.position, (*q.shape[:-1], 1, 3))
-        flange = flange_transforms(q, self.spec)
-        tool = (flange @ cell.tool).position[..., None, :]
-        chain = cell.world.inverse.apply(np.concatenate([foot, points, tool], axis=-2))
-        ends: FloatArray = np.stack([chain[..., :-1, :], chain[..., 1:, :]], axis=-2)
+        cell, q, model = cell_transforms(self.spec), np.asarray(joints, dtype=float), self.spec.kinematics
+        tool = (flange_transforms(q, self.spec) @ cell.tool).position[..., None, :]
+        points = np.concatenate([cell.base.apply(model.points(q)), tool], axis=-2)
+        chain = cell.world.inverse.apply(points)
+        first, second = ([getattr(link, end) for link in model.bars] for end in ("first", "second"))
+        ends: FloatArray = np.stack([chain[..., first, :], chain[..., second, :]], axis=-2)
         return ends
 
     def tool(self, joints: FloatArray) -> FloatArray:

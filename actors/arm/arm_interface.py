@@ -94,7 +94,7 @@ class PathReport:
 
     Attributes:
         joint_speed: of the fastest joint [rad/s]; `fastest_joint` is its index from 0. Both are 0 if joints are
-            unknown.
+            unknown. `joint_name` is its name; '' for 'joint 1' and so on.
         tool_speed: of the fastest point of tool or pourer [m/s].
         tilt: largest [rad]; tilt_speed: largest [rad/s].
         singularity: smallest distance from a singularity, as `ArmLimits.singularity`; 1 for an arm that has none.
@@ -116,6 +116,12 @@ class PathReport:
     high: tuple[float, float, float]
     duration: float
     deviation: float = 0.0
+    joint_name: str = ""
+
+    @property
+    def fastest(self) -> str:
+        """Name of the fastest joint."""
+        return self.joint_name or f"joint {self.fastest_joint + 1}"
 
 
 class PlannedPour(Protocol):

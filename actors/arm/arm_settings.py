@@ -25,8 +25,9 @@ from sim_engine.settings.model import SET_BY_PROGRAM, Problems, Settings
 from sim_engine.settings.plugin_registry import PluginRegistry
 
 if TYPE_CHECKING:
-    from actors.arm.arm_interface import ArmFacts, ArmFigure, PlannedPour
+    from actors.arm.arm_interface import ArmFacts, ArmFigure, FloatArray, PlannedPour
     from actors.arm.planned_pour import PlaceWay
+    from sim_engine.scene import SampledMotion
     from sim_engine.vessel.vessel import Vessel
 
 
@@ -103,6 +104,9 @@ class ArmSettings(Settings):
     default_tag: ClassVar[str] = "ur"
     plugins: ClassVar[str] = "decant.arms"
 
+    digital_outputs: ClassVar[bool] = False
+    """Whether `address` is a controller whose digital outputs can switch a gripper, as a UR's can."""
+
     kind: str = ""
     """Kind of the arm."""
 
@@ -161,7 +165,7 @@ class History:
 
     Attributes:
         times: controller times [s], increasing.
-        joints: six joint angles at each time [rad].
+        joints: joint angles at each time [rad].
         now: controller time of the request [s].
     """
 
@@ -306,7 +310,35 @@ class ArmKind(ABC, Generic[S]):
         return self.spec
 
     def start_emulator(self) -> ArmEmulator | None:
-        """Start the emulator of the arm on a virtual bench; None if the driver is a simulation itself."""
+        """Start the emulator of the arm on a virtual bench; None if the driver is a simulation itself.
+
+        The liquid of the bench follows the emulator's joints (`pourer_motion`); plans are then `PourPath`s.
+        """
+        return None
+
+    def pourer_motion(self, joints: FloatArray, times: FloatArray, *, grip_tilt: float = 0.0) -> SampledMotion:
+        """The motion of the pourer for joints that encoders measured.
+
+        Args:
+            joints: shape (T, n) [rad].
+            times: of the readings, shape (T,), increasing from 0 [s].
+            grip_tilt: error of grip: the pourer is rotated in the gripper by this angle about its own y axis, and
+                therefore tilted more [rad]. An arm cannot measure it; it belongs to the ground truth of a virtual
+                bench.
+
+        Raises:
+            LaboratoryError: the arm has no figure, which gives the pourer's pose.
+        """
+        from actors.arm.planned_pour import slipped
+        from sim_engine.scene import SampledMotion
+
+        figure = self.figure()
+        if figure is None:
+            raise LaboratoryError(f"an arm of the kind '{self.spec.kind}' has no figure: its joints give no pose")
+        return slipped(SampledMotion(times, figure.pourer(joints)), grip_tilt)
+
+    def workspace(self) -> FloatArray | None:
+        """Corners in the world, shape (8, 3) [m], of the box that tool and pourer may not leave; None without one."""
         return None
 
     def figure(self) -> ArmFigure | None:

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import base64
+import math
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_interface import PathReport
+from actors.arm.arm_interface import ArmRefusedError, PathReport
 from sim_engine.motion import PourMotion
 from sim_engine.scene import SampledMotion
 
@@ -36,7 +37,7 @@ class JointPath:
 
     Attributes:
         times: (T,) increasing from 0 [s]; T ≥ 2.
-        joints: (T, 6) [rad], without jumps by full turns.
+        joints: (T, n) [rad], without jumps by full turns.
     """
 
     times: FloatArray
@@ -48,8 +49,26 @@ class JointPath:
         return float(self.times[-1])
 
     def at(self, times: FloatArray) -> FloatArray:
-        """Joints at times [s], clamped at both ends, shape (T, 6) [rad]."""
-        return np.stack([np.interp(times, self.times, self.joints[:, k]) for k in range(6)], axis=-1)
+        """Joints at times [s], clamped at both ends, shape (T, n) [rad]."""
+        return np.stack([np.interp(times, self.times, column) for column in self.joints.T], axis=-1)
+
+
+def checked(path: JointPath, count: int) -> JointPath:
+    """Check that an arm can follow a path. Returns the path.
+
+    Raises:
+        ArmRefusedError: its shape, its times or its numbers are invalid.
+    """
+    times, joints = np.asarray(path.times, dtype=float), np.asarray(path.joints, dtype=float)
+    if times.ndim != 1 or len(times) < 2 or joints.shape != (len(times), count):
+        raise ArmRefusedError(
+            f"a path has two or more times and {count} joints for each, not {times.shape} and {joints.shape}"
+        )
+    if not (np.all(np.isfinite(times)) and np.all(np.isfinite(joints))):
+        raise ArmRefusedError("a path must be made of finite numbers")
+    if times[0] != 0.0 or np.any(np.diff(times) <= 0.0):
+        raise ArmRefusedError("a path's times must begin at 0 and increase")
+    return JointPath(times, joints)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +111,7 @@ class PourPath:
 
     @property
     def tilt_part(self) -> tuple[FloatArray, FloatArray]:
-        """Increasing tilts of the first phase, (T,) [rad], and the joints at them, (T, 6) [rad]."""
+        """Increasing tilts of the first phase, (T,) [rad], and the joints at them, (T, n) [rad]."""
         during = self.pour.times <= self.phases[0][2] + 1e-9
         tilts, joints = self.tilts[during], self.pour.joints[during]
         rising = np.concatenate([[True], tilts[1:] > np.maximum.accumulate(tilts)[:-1] + 1e-5])
@@ -165,7 +184,7 @@ class ExecutedPath:
 
     Attributes:
         times: (T,) since the path's start, increasing from 0 [s of controller time], at least 100 Hz.
-        joints: (T, 6) [rad].
+        joints: (T, n) [rad].
         completed: False if it was stopped before its end.
         tracking: errors in following the path: 'rms_angle', 'max_angle' [rad] of the joints, 'rms_tool', 'max_tool'
             [m], the 'lag' [s] that was removed from them, and the 'longest_gap' between two readings [s].
@@ -195,7 +214,7 @@ def pack(executed: ExecutedPath) -> dict[str, Any]:
     """
     columns = np.column_stack([executed.times / TIME_UNIT, executed.joints / JOINT_UNIT])
     integers = np.round(columns).astype("<i4")
-    data = np.diff(integers, axis=0, prepend=np.zeros((1, 7), "<i4")).astype("<i4").T.tobytes()
+    data = np.diff(integers, axis=0, prepend=np.zeros((1, columns.shape[1]), "<i4")).astype("<i4").T.tobytes()
     return {
         "samples": len(integers),
         "completed": executed.completed,
@@ -220,12 +239,20 @@ def unpack(data: dict[str, Any]) -> ExecutedPath:
     """
     try:
         raw = zlib.decompress(base64.b85decode(data["packed"]))
-        steps = np.frombuffer(raw, "<i4").reshape(7, int(data["samples"])).T
+        steps = np.frombuffer(raw, "<i4").reshape(-1, int(data["samples"])).T if raw else np.zeros((0, 7), "<i4")
         integers = np.cumsum(steps, axis=0)
         times, joints = integers[:, 0].astype(float) * TIME_UNIT, integers[:, 1:].astype(float) * JOINT_UNIT
         return ExecutedPath(times, joints, bool(data["completed"]), dict(data["tracking"]))
     except (KeyError, TypeError, ValueError, zlib.error) as error:
         raise ValueError(f"not an executed path: {error!r}") from error
+
+
+def slipped(motion: SampledMotion, grip_tilt: float) -> SampledMotion:
+    """The motion of a pourer that is rotated in the grip by `grip_tilt` [rad] about the y axis of its underside."""
+    c, s = math.cos(0.5 * grip_tilt), math.sin(0.5 * grip_tilt)
+    w, x, y, z = (motion.poses[:, k] for k in range(3, 7))
+    turned = np.stack([c * w - s * y, c * x - s * z, c * y + s * w, c * z + s * x], axis=-1)
+    return SampledMotion(motion.times, np.concatenate([motion.poses[:, :3], turned], axis=-1))
 
 
 @dataclass(frozen=True, eq=False)

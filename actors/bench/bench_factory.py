@@ -15,8 +15,8 @@ from typing import Any
 from actors.arm.arm_device import DeviceArm
 from actors.arm.arm_interface import PlannedPour
 from actors.arm.arm_settings import ArmSettings, arm_kind
+from actors.arm.pour_feasibility import path_of
 from actors.arm.simulated_arm import SimulatedArmSettings
-from actors.arm.ur_settings import UrArmSettings
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceSettings, balance_kind
 from actors.balance.weighing_plan import Placement, PourMasses
@@ -29,7 +29,6 @@ from actors.bench.ground_truth import GroundTruth
 from actors.bench.held_vessel import HeldVessel, HoldingArm
 from actors.bench.liquid_supply import LiquidSupply, PumpDevice, SpillWatch
 from actors.bench.night_consent import NightConsent
-from actors.bench.pour_feasibility import path_of
 from actors.bench.pour_procedure import BenchProcedure, PourProcedure
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
 from actors.bench.vessel_carrying import VesselCarrier
@@ -362,7 +361,7 @@ async def _open_devices(
     if emulators is not None and spec.bench is not None and liquid is not None:
         contents = BenchContents(balance_spec.position)
         hands = Hands(contents, None if balance is None else emulators.put, None if held is None else emulators.hold)
-        if isinstance(true_arm, UrArmSettings):
+        if true_arm is not None:
             drivers: list[DeviceArm | DeviceBalance] = [arm, *([] if balance is None else [balance])]
             ground_truth = FollowedBench(spec.bench, true_arm, emulators, hands, liquid, drivers)
         else:

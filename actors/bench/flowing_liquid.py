@@ -18,10 +18,11 @@ from typing import Protocol
 
 import numpy as np
 
-from actors.arm.ur_settings import UrArmSettings
+from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.dosing.virtual_dosing_bench import LONGEST_DOSE, TIME_STEP, LivePour, TrueCup, TrueScale, VirtualDosingBench
 from actors.interfaces import LaboratoryError
 from actors.runtime.bench_clock import device_clock
+from sim_engine.collision import rotations
 from sim_engine.liquids import Liquid
 
 INTERVAL = 0.02
@@ -85,7 +86,7 @@ class JointHistory(Protocol):
 
     @property
     def joints(self) -> tuple[tuple[float, ...], ...]:
-        """Six joint angles at each time [rad]."""
+        """Joint angles at each time [rad]."""
         ...
 
     @property
@@ -107,11 +108,15 @@ class FlowingLiquid:
     def __init__(
         self,
         order: FlowOrder,
-        arm: UrArmSettings,
+        arm: ArmSettings,
         history: Callable[[float], JointHistory],
         load: Callable[[float], None],
     ) -> None:
         self._order, self._arm, self._history, self._put = order, arm, history, load
+        figure = arm_kind(arm).figure()
+        if figure is None:
+            raise LaboratoryError(f"an arm of the kind '{arm.kind}' has no figure: its joints give no tilt")
+        self._figure = figure
         scale = TrueScale()  # the balance has an emulator of its own
         self._bench = VirtualDosingBench(
             order.cup,
@@ -168,15 +173,13 @@ class FlowingLiquid:
 
     def _follow(self) -> None:
         """Pour along the motion since the last call."""
-        from actors.arm.planning.kinematics import pourer_transforms
-
         changes = self._history(self._since)
         fresh = [(t, q) for t, q in zip(changes.times, changes.joints, strict=True) if self._since < t <= changes.now]
         if not fresh:
             return
         times = np.array([t for t, _ in fresh])
-        turned = pourer_transforms(np.array([q for _, q in fresh]), self._arm).rotation
-        tilts = np.arccos(np.clip(turned[..., 2, 2], -1.0, 1.0))
+        turned = rotations(self._figure.pourer(np.array([q for _, q in fresh])))
+        tilts = np.arccos(np.clip(turned[:, 2, 2], -1.0, 1.0))
         load = 0.0
         for moment, tilt in zip(times, tilts, strict=True):
             load = self._advance(float(moment), float(tilt), load)

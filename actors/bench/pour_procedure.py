@@ -28,12 +28,12 @@ from actors.arm.arm_interface import (
     Executed,
     PlannedPour,
 )
+from actors.arm.pour_feasibility import vessel
 from actors.balance.balance_interface import BalanceError, NoConnectionError
 from actors.balance.weighing import Weighings
 from actors.balance.weighing_plan import Placement, PourMasses
 from actors.bench.consent import Consent, Setup, grams, start_question
 from actors.bench.ground_truth import PourAsk
-from actors.bench.pour_feasibility import vessel
 from actors.dosing.dose_estimator import DoseReading
 from actors.interfaces import (
     DoseProgress,

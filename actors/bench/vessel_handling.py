@@ -20,12 +20,12 @@ from itertools import product
 
 from actors.arm.arm_interface import PlannedPour
 from actors.arm.arm_settings import ArmSettings, arm_kind
+from actors.arm.pour_feasibility import vessel as built
 from actors.balance.balance_settings import BalanceSettings
 from actors.balance.weighing_plan import GRIP, SURE, PourMasses, weighing_uncertainty
 from actors.bench.cell_liquids import CellLiquids
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.liquid_supply import LiquidSupply
-from actors.bench.pour_feasibility import vessel as built
 from actors.bench.vessel_carrying import (
     Load,
     MotionConsent,

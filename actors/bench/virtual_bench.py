@@ -4,7 +4,7 @@
   it on the bench's machine, next to the drivers that connect to it. `DeviceEmulators` offers the same calls to the
   event loop. The emulators themselves are in `actors.emulators`.
 - `VirtualBench` takes the motion from the poses that the arm read back, `FollowedBench` from the joint history of the
-  arm's emulator. `executed_pour` cuts the pour out of that history; `slipped` applies a grip error.
+  arm's emulator. `executed_pour` cuts the pour out of that history.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from actors.arm.arm_device import DeviceArm
 from actors.arm.arm_interface import Executed
 from actors.arm.arm_settings import ArmEmulator, ArmSettings, History, arm_kind
-from actors.arm.ur_settings import UrArmSettings
+from actors.arm.planned_pour import slipped
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceEmulator, BalanceSettings, balance_kind
 from actors.balance.scale_model import Load
@@ -173,8 +173,8 @@ class BenchEmulators:
         """
         self.flowed()
         arm = None if self._arm is None else self._arm.true_arm
-        if not isinstance(arm, UrArmSettings) or self._balance is None:
-            raise LaboratoryError("the virtual bench pours wanted amounts with an emulated UR arm and balance only")
+        if arm is None or self._balance is None:
+            raise LaboratoryError("the virtual bench pours wanted amounts with an emulated arm and balance only")
         self._flow = FlowingLiquid(order, arm, self.history, self._load)
 
     def flowed(self) -> FlowEnd | None:
@@ -306,14 +306,6 @@ def _film(seed: int) -> float:
     return FILM * (1.0 + 0.1 * float(np.random.default_rng((seed, 71)).standard_normal()))
 
 
-def slipped(motion: SampledMotion, grip_tilt: float) -> SampledMotion:
-    """The motion of a pourer that is rotated in the grip by `grip_tilt` [rad] about the y axis of its underside."""
-    c, s = math.cos(0.5 * grip_tilt), math.sin(0.5 * grip_tilt)
-    w, x, y, z = (motion.poses[:, k] for k in range(3, 7))
-    turned = np.stack([c * w - s * y, c * x - s * z, c * y + s * w, c * z + s * x], axis=-1)
-    return SampledMotion(motion.times, np.concatenate([motion.poses[:, :3], turned], axis=-1))
-
-
 def executed_pour(times: FloatArray, joints: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     """Return the part of a history that is the pour: from the first movement away from its first pose to the last
     movement.
@@ -323,8 +315,8 @@ def executed_pour(times: FloatArray, joints: FloatArray, start: FloatArray) -> t
 
     Args:
         times: shape (T,), increasing [s].
-        joints: shape (T, 6) [rad].
-        start: the pour's first joints, shape (6,) [rad].
+        joints: shape (T, n) [rad].
+        start: the pour's first joints, shape (n,) [rad].
 
     Returns:
         Times from 0, and joints; None if the arm did not move after standing at the start.
@@ -474,7 +466,7 @@ class FollowedBench(VirtualBench):
     def __init__(
         self,
         spec: BenchSettings,
-        arm: UrArmSettings,
+        arm: ArmSettings,
         emulators: DeviceEmulators,
         hands: Hands,
         simulators: SimulatorPool,
@@ -614,8 +606,6 @@ class FollowedBench(VirtualBench):
 
     def _motion(self, executed: Executed | None, grip_tilt: float) -> SampledMotion | None:
         """The true motion of the pourer from the pour's first pose on; None if the pourer never left it."""
-        from actors.arm.planning.kinematics import pourer_motion
-
         if self._gap:
             raise LaboratoryError(
                 f"the virtual bench can't tell what became of the liquid: {self._gap}, because a process of the bench "
@@ -629,11 +619,12 @@ class FollowedBench(VirtualBench):
         if cut is None:
             return None
         times, joints = cut
-        tilted = np.flatnonzero(pourer_motion(joints, times, self._arm).tilt(times) > UPRIGHT)
+        kind = arm_kind(self._arm)
+        tilted = np.flatnonzero(kind.pourer_motion(joints, times).tilt(times) > UPRIGHT)
         if len(tilted) == 0:
             return None
         end = min(int(tilted[-1]) + 2, len(times))  # the rest is the return path
-        return pourer_motion(joints[:end], times[:end], self._arm, grip_tilt=grip_tilt)
+        return kind.pourer_motion(joints[:end], times[:end], grip_tilt=grip_tilt)
 
 
 def _missed(history: History, since: float) -> float:

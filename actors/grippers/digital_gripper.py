@@ -24,7 +24,6 @@ from pydantic_core import PydanticCustomError
 
 from actors.arm.arm_settings import ArmSettings
 from actors.arm.ur.primary_interface import MASTERBOARD, PORT, PrimaryError, read_parts
-from actors.arm.ur_settings import UrArmSettings
 from actors.grippers.gripper_interface import REST, Force, GripperError, GripperSettings, GripperState, Width
 from sim_engine.settings.model import Example, Problems
 from sim_engine.settings.quantity import Quantity
@@ -132,7 +131,7 @@ class DigitalSettings(GripperSettings):
     def check_laboratory(self, problems: Problems, *, mode: str, arm: ArmSettings | None) -> None:
         """See `GripperSettings.check_laboratory`."""
         super().check_laboratory(problems, mode=mode, arm=arm)
-        if arm is not None and not isinstance(arm, UrArmSettings):
+        if arm is not None and not arm.digital_outputs:
             problems.add("the outputs are those of a UR arm, and this is another one", "kind")
 
 

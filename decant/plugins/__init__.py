@@ -34,8 +34,17 @@ if TYPE_CHECKING:
     from actors.arm.arm_settings import ArmKind as ArmKind
     from actors.arm.arm_settings import ArmSettings as ArmSettings
     from actors.arm.arm_settings import History as History
+    from actors.arm.joint_driver import JointArm as JointArm
+    from actors.arm.joint_driver import JointReading as JointReading
+    from actors.arm.joint_driver import JointRobot as JointRobot
+    from actors.arm.joint_driver import VelocityArm as VelocityArm
+    from actors.arm.joint_driver import VelocityRobot as VelocityRobot
     from actors.arm.planned_pour import ExecutedMotion as ExecutedMotion
+    from actors.arm.planned_pour import JointPath as JointPath
     from actors.arm.planned_pour import MotionPath as MotionPath
+    from actors.arm.pour_feasibility import plan_pour as plan_pour
+    from actors.arm.urdf_chain import ChainArmKind as ChainArmKind
+    from actors.arm.urdf_chain import ChainArmSettings as ChainArmSettings
     from actors.arm_geometry import Pose as Pose
     from actors.arm_geometry import RobotCell as RobotCell
     from actors.balance.balance_interface import BalanceDriver as BalanceDriver
@@ -56,7 +65,6 @@ if TYPE_CHECKING:
     from actors.balance.readings import WeightMark as WeightMark
     from actors.balance.scale_model import Load as Load
     from actors.balance.serial_balance import SerialBalance as SerialBalance
-    from actors.bench.pour_feasibility import plan_pour as plan_pour
     from actors.grippers.gripper_interface import Gripper as Gripper
     from actors.grippers.gripper_interface import GripperEmulator as GripperEmulator
     from actors.grippers.gripper_interface import GripperError as GripperError

@@ -20,8 +20,8 @@ import numpy as np
 
 from actors.arm.arm_interface import PlannedPour
 from actors.arm.arm_settings import ArmSettings, arm_kind
-from actors.bench.pour_feasibility import path_of
-from actors.bench.pour_feasibility import vessel as built
+from actors.arm.pour_feasibility import path_of
+from actors.arm.pour_feasibility import vessel as built
 from actors.grippers.gripper_interface import GripperSettings
 from actors.interfaces import DoseTarget, InvalidActionError, LaboratoryError, UnreachablePlaceError
 from actors.laboratory_settings import LaboratorySettings

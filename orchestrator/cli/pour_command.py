@@ -145,19 +145,22 @@ def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | No
 
 
 def _draw(chosen: Chosen, png: Path) -> None:
+    from actors.arm.arm_settings import arm_kind
     from actors.arm.planned_pour import PourPath
-    from actors.arm.ur_settings import UrArmSettings
     from orchestrator.reports import figure_style
     from orchestrator.reports.pour_figures import draw_path
     from sim_engine.vessel.vessel import build_vessel
 
     arm = chosen.plan.laboratory.expected_arm
-    if not isinstance(chosen.path, PourPath) or not isinstance(arm, UrArmSettings):
+    kind = None if arm is None else arm_kind(arm)
+    shown = None if kind is None else kind.figure()
+    if kind is None or shown is None or not isinstance(chosen.path, PourPath):
         raise RefusalError("--png: draws the joints of an arm, and this arm's path has none")
     pourer, receiver = build_vessel(chosen.scene.pourer), build_vessel(chosen.scene.receiver)
     figure = draw_path(
         chosen.path,
-        arm,
+        shown,
+        kind.workspace(),
         pourer,
         receiver,
         title=f"{chosen.scene.pourer.name} into {chosen.scene.receiver.name}, laboratory {chosen.plan.laboratory.name}",

@@ -253,7 +253,7 @@ class CellScene:
 
 def planned_poses(scene: Scene, pour: Pour) -> FloatArray | None:
     """Return poses of the pourer along a planned pour, shape (T, 7); None if planning fails."""
-    from actors.bench.pour_feasibility import plan_pour
+    from actors.arm.pour_feasibility import plan_pour
     from actors.interfaces import InvalidActionError
 
     try:

@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from actors.arm.planned_pour import unpack
-from actors.arm.planning.kinematics import pourer_motion
-from actors.arm.ur_settings import UrArmSettings
+from actors.arm.arm_settings import arm_kind
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.learning.campaign_plan import CampaignPlan
@@ -131,13 +129,15 @@ def _executed(notes: Mapping[str, Any], plan: CampaignPlan) -> Pairs:
         ValueError: they are not recorded.
     """
     record, arm = notes.get("executed") or {}, plan.laboratory.arm
-    if not isinstance(arm, UrArmSettings) or "packed" not in record:
+    kind = None if arm is None else arm_kind(arm)
+    figure = None if kind is None else kind.figure()
+    executed = None if figure is None else figure.executed(record)
+    if kind is None or executed is None:
         raise ValueError("its tilt is not recorded: simulated benches execute the planned motion")
-    executed = unpack(dict(record))
-    times, joints = executed.times, executed.joints
+    times, joints = executed
     if len(times) < 2:
         raise ValueError("its arm reported no motion")
-    tilt = np.degrees(pourer_motion(joints, times, arm).tilt(times))
+    tilt = np.degrees(kind.pourer_motion(joints, times).tilt(times))
     every = max(len(times) // 1000, 1)
     return [(float(t), round(float(a), 3)) for t, a in zip(times[::every], tilt[::every], strict=True)]
 

@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import textwrap
 from collections import defaultdict
@@ -26,10 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from actors.arm.arm_interface import ArmFigure
     from actors.arm.planned_pour import PourPath
-    from actors.arm.planning.kinematics import Transforms
-    from actors.arm.planning.trajectory import SampledPath
-    from actors.arm.ur_settings import UrArmSettings
     from sim_engine.outcome import SimulatedPour
     from sim_engine.scene import PourTask
     from sim_engine.vessel.vessel import Vessel
@@ -381,52 +378,62 @@ _MARGIN = 40.0
 
 
 def draw_path(
-    path: PourPath, spec: UrArmSettings, pourer: Vessel, receiver: Vessel, *, title: str, note: str = ""
+    path: PourPath,
+    arm: ArmFigure,
+    box: Floats | None,
+    pourer: Vessel,
+    receiver: Vessel,
+    *,
+    title: str,
+    note: str = "",
 ) -> Figure:
     """Figure of an arm's path.
 
     Args:
         path: the planned path.
-        spec: settings of the arm and its cell.
+        arm: its figure.
+        box: corners (8, 3) of the box of its limits in the world [m]; None without one.
         pourer, receiver: geometry.
         title: first line.
         note: text below the title.
     """
-    from actors.arm.planning.kinematics import cell_transforms
-    from actors.arm.planning.trajectory import SampledPath
-
-    stretches = [SampledPath.of(name, getattr(path, name), spec) for name, _, _ in _WAYS]
-    world = cell_transforms(spec).world.inverse
-    base, table = 1e3 * world.position, float(1e3 * world.apply(np.array([[0.0, 0.0, spec.cell.table]]))[0, 2])
+    ways = [getattr(path, name).joints for name, _, _ in _WAYS]
+    base, table = 1e3 * arm.ends(path.pour.joints[0])[0, 0], 1e3 * arm.table
+    poses = arm.pourer(path.pour.joints)
+    largest = int(np.argmax(path.tilts))
+    half = int(np.argmax(path.tilts >= 0.5 * path.tilts[largest]))
     # Seen along the direction to the robot, the base would be hidden below the receiver, so the arm is drawn from the
     # side.
     across = 0 if abs(base[0]) > abs(base[1]) else 1
     figure, (near, top, front) = style.new_figure(1, 3, size=(15.0, 6.0), width_ratios=(1.0, 1.0, 1.0))
     lines = [title, *textwrap.wrap(note, _LINE)]
     figure.suptitle("\n".join(lines), fontsize=10.5, color=style.INK, x=0.01, ha="left")
-    _near(near, stretches, world, table, pourer, receiver)
+    angle = f"up to {math.degrees(float(path.tilts[largest])):.0f} deg"
+    cups = _vessels_from_the_side(near, poses[[0, half, largest]], angle, pourer, receiver)
+    _near(near, ways, arm, table, cups)
     for axes, horizontal, vertical, name in (
         (top, 0, 1, "the cell from above"),
         (front, across, 2, "the cell from the side" if across == 0 else "the cell across the pour"),
     ):
-        _cell(axes, stretches[1], spec, world, (horizontal, vertical))
+        seen = [horizontal, vertical]
+        if box is not None:
+            _outline(axes, box[:, seen], label="box of the laboratory's file")
+        _arm(axes, arm.ends(path.pour.joints[[0, largest]]), seen)
         style.dress(axes, title=name, x=_AXES[horizontal], y=_AXES[vertical], grid="both")
         axes.plot(base[horizontal], base[vertical], "s", color=style.INK, markersize=9, label="robot's base", zorder=5)
-    _from_above(top, stretches[1], pourer, receiver)
-    _upright(front, stretches[1], pourer, receiver, across)
+    _from_above(top, poses[0], pourer, receiver)
+    _upright(front, poses[0], pourer, receiver, across)
     front.axhline(table, color=style.INK, linewidth=1.0)
     handles = {n: h for axes in (near, top) for h, n in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, fontsize=9, frameon=False)
     return figure
 
 
-def _near(
-    axes: Axes, stretches: list[SampledPath], world: Transforms, table: float, pourer: Vessel, receiver: Vessel
-) -> None:
-    """The pour: cross-sections of both vessels, and the paths of tool and pourer near them."""
-    shown = [_vessels_from_the_side(axes, stretches[1], pourer, receiver)]
-    for stretch, (name, way, colour) in zip(stretches, _WAYS, strict=True):
-        tool, underside = 1e3 * world.apply(stretch.tool), 1e3 * stretch.poses[:, :3]
+def _near(axes: Axes, ways: list[Floats], arm: ArmFigure, table: float, cups: Floats) -> None:
+    """The pour: cross-sections of both vessels (`cups`), and the paths of tool and pourer near them."""
+    shown = [cups]
+    for joints, (name, way, colour) in zip(ways, _WAYS, strict=True):
+        tool, underside = 1e3 * arm.tool(joints)[:, :3], 1e3 * arm.pourer(joints)[:, :3]
         axes.plot(tool[:, 0], tool[:, 2], color=colour, linewidth=1.4, label=f"tool, {way}")
         axes.plot(
             underside[:, 0], underside[:, 2], ":", color=colour, linewidth=1.4, label=f"pourer's underside, {way}"
@@ -442,19 +449,14 @@ def _near(
     style.dress(axes, title="the pour from the side", x=_AXES[0], y=_AXES[2], grid="both")
 
 
-def _cell(axes: Axes, pour: SampledPath, spec: UrArmSettings, world: Transforms, seen: tuple[int, int]) -> None:
-    """The box of the arm's limits, and the arm at the start of the pour and at its largest tilt."""
-    corners = np.array(
-        list(itertools.product(*zip(spec.limits.box.low.vector, spec.limits.box.high.vector, strict=True)))
-    )
-    _outline(axes, world.apply(corners)[:, list(seen)], label="box of the laboratory's file")
-    largest = int(np.argmax(pour.tilts))
-    for index, colour, name in ((0, style.PALE, "arm, upright"), (largest, style.FALLING, "arm, largest tilt")):
-        foot = np.zeros((1, 3))
-        links = np.concatenate([foot, pour.links[index]])
-        points = 1e3 * world.apply(links)[:, list(seen)]
+def _arm(axes: Axes, ends: Floats, seen: list[int]) -> None:
+    """The arm at the start of the pour and at its largest tilt, from its bars' ends (2, bars, 2, 3) [m]."""
+    for bars, colour, name in zip(
+        ends, (style.PALE, style.FALLING), ("arm, upright", "arm, largest tilt"), strict=True
+    ):
+        links = np.concatenate([bars[:, 0], bars[-1:, 1]])
         axes.plot(
-            *points.T,
+            *(1e3 * links[:, seen]).T,
             color=colour,
             linewidth=6.0,
             solid_capstyle="round",
@@ -475,35 +477,32 @@ def _outline(axes: Axes, points: Floats, *, label: str) -> None:
     axes.update_datalim(corners)
 
 
-def _vessels_from_the_side(axes: Axes, pour: SampledPath, pourer: Vessel, receiver: Vessel) -> Floats:
-    """Cross-sections of the receiver, and of the pourer upright, half-way and at its largest tilt; outlines [mm]."""
+def _vessels_from_the_side(axes: Axes, poses: Floats, angle: str, pourer: Vessel, receiver: Vessel) -> Floats:
+    """Cross-sections of the receiver, and of the pourer at poses (3, 7), the last of them named; outlines [mm]."""
     outlines = [section(np.asarray(v.solid_vertices, float), np.asarray(v.solid_faces)) for v in (pourer, receiver)]
     stand = [1e3 * place(loop, UPRIGHT) for loop in outlines[1]]
     fill_section(axes, stand, facecolor=style.RECEIVED, linewidth=0.0, label="receiver")
-    largest = int(np.argmax(pour.tilts))
-    half = int(np.argmax(pour.tilts >= 0.5 * pour.tilts[largest]))
     cups = list(stand)
-    for index, opacity in ((0, 0.35), (half, 0.35), (largest, 1.0)):
-        placed = [1e3 * place(loop, pour.poses[index]) for loop in outlines[0]]
-        name = f"pourer, up to {math.degrees(float(pour.tilts[largest])):.0f} deg" if index == largest else None
+    for pose, opacity, name in zip(poses, (0.35, 0.35, 1.0), (None, None, f"pourer, {angle}"), strict=True):
+        placed = [1e3 * place(loop, pose) for loop in outlines[0]]
         fill_section(axes, placed, facecolor=style.POURER, alpha=opacity, linewidth=0.0, label=name)
         cups += placed
     return np.concatenate(cups)
 
 
-def _from_above(axes: Axes, pour: SampledPath, pourer: Vessel, receiver: Vessel) -> None:
+def _from_above(axes: Axes, pose: Floats, pourer: Vessel, receiver: Vessel) -> None:
     from matplotlib.patches import Circle
 
     axes.add_patch(Circle((0.0, 0.0), 1e3 * receiver.outer_radius, facecolor=style.RECEIVED, alpha=0.8, zorder=3))
-    start = 1e3 * pour.poses[0]
+    start = 1e3 * pose
     axes.add_patch(Circle((start[0], start[1]), 1e3 * pourer.outer_radius, facecolor=style.POURER, alpha=0.6, zorder=3))
 
 
-def _upright(axes: Axes, pour: SampledPath, pourer: Vessel, receiver: Vessel, across: int) -> None:
+def _upright(axes: Axes, start: Floats, pourer: Vessel, receiver: Vessel, across: int) -> None:
     """Both vessels as rectangles of their width and height, the pourer before it tilts."""
     from matplotlib.patches import Rectangle
 
-    for vessel, pose, colour in ((receiver, UPRIGHT, style.RECEIVED), (pourer, pour.poses[0], style.POURER)):
+    for vessel, pose, colour in ((receiver, UPRIGHT, style.RECEIVED), (pourer, start, style.POURER)):
         wide, height = 1e3 * vessel.outer_radius, 1e3 * float(np.ptp(np.asarray(vessel.solid_vertices)[:, 2]))
         corner = (1e3 * pose[across] - wide, 1e3 * pose[2])
         axes.add_patch(Rectangle(corner, 2 * wide, height, facecolor=colour, alpha=0.6, zorder=3))

@@ -19,8 +19,7 @@ import numpy as np
 
 from actors.arm.arm_interface import PathReport
 from actors.arm.arm_settings import ArmSettings, SafetyRecord
-from actors.arm_geometry import JOINT_NAMES
-from actors.bench.pour_feasibility import path_of
+from actors.arm.pour_feasibility import path_of
 from actors.interfaces import InvalidActionError
 from actors.optimizer.questions import Linear
 from orchestrator.learning.calibration.action_prior import actions_all_over
@@ -155,6 +154,7 @@ class Envelope:
         return PathReport(
             joint_speed=fastest.joint_speed,
             fastest_joint=fastest.fastest_joint,
+            joint_name=fastest.joint_name,
             tool_speed=max(r.tool_speed for r in self.reports),
             tilt=max(r.tilt for r in self.reports),
             tilt_speed=max(r.tilt_speed for r in self.reports),
@@ -250,7 +250,7 @@ def report_lines(report: PathReport) -> list[str]:
         "box            " + ", ".join(f"{n} {a} … {b} mm" for n, a, b in zip("xyz", low, high, strict=True)),
         f"tool, pourer   up to {1e3 * report.tool_speed:.0f} mm/s",
         *(
-            [f"joints         up to {math.degrees(report.joint_speed):.0f} deg/s, {JOINT_NAMES[report.fastest_joint]}"]
+            [f"joints         up to {math.degrees(report.joint_speed):.0f} deg/s, {report.fastest}"]
             if report.joint_speed > 0.0
             else []
         ),

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from actors.arm.arm_settings import ArmSettings
-from actors.bench.pour_feasibility import path_of
+from actors.arm.pour_feasibility import path_of
 from actors.interfaces import (
     Answering,
     Bench,

@@ -15,6 +15,7 @@ import pytest
 
 from actors.runtime.child_process import child_environment
 from tests.support import small_campaign
+from tests.support.other_arm import SEVEN_JOINTS
 
 ROOT = Path(__file__).parents[2]
 
@@ -193,7 +194,9 @@ outputs: {directory: runs}
 
 @pytest.mark.slow
 def test_a_campaign_runs_with_an_arm_of_seven_joints(decant: Decant, folder: Path) -> None:
-    arm = "arm: {kind: seven-joint}\ncell: {receiver: {x: 700 mm, y: 0 mm, z: 150 mm}, direction: 90 deg}"
+    pytest.importorskip("pinocchio")
+    cell = "cell: {receiver: {x: 700 mm, y: 0 mm, z: 150 mm}, direction: 90 deg}"
+    arm = f"arm: {json.dumps({**SEVEN_JOINTS, 'kind': 'seven-joint'})}\n{cell}"
     laboratory = LABORATORY.replace("arm: {kind: stand, fastest: 130 deg/s}", arm).replace("scale: 60", "scale: 4")
     (folder / "example.yaml").write_text(laboratory)
     (folder / "campaign.yaml").write_text(CAMPAIGN)

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.planning.kinematics import flange_poses, inverse, posture
+from actors.arm.planning.kinematics import flange_poses
 from actors.arm.planning.trajectory import follow
 from actors.arm.ur.robot_models import MODELS
+from actors.arm.ur.ur_kinematics import inverse, posture
 from actors.arm.ur_settings import UrArmSettings
 from actors.arm_geometry import ArmLimits, Box, JointAngles, Point, Pose, RobotCell
 from orchestrator.campaigns.file_loading import load_vessel

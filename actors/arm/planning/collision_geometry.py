@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from actors.arm.planning.kinematics import cell_transforms
 from actors.arm.planning.trajectory import SampledPath
-from actors.arm.ur.robot_models import SAME_ANGLE, SAME_PLACE
 from sim_engine.collision import clearance, thinned, way_of
 from sim_engine.vessel.distance_grid import MARGIN
 from sim_engine.vessel.vessel import Vessel
@@ -19,10 +18,6 @@ FloatArray = NDArray[np.float64]
 
 COARSE, FINE = 10e-3, 2e-3
 """Largest displacement of any point of the pourer between two checked poses, far from and near to the receiver [m]."""
-
-LINKS = (("upper arm", 1, 2, 0.08), ("forearm", 3, 4, 0.06), ("wrist", 4, 5, 0.06), ("wrist", 5, 6, 0.06),
-         ("wrist", 6, 7, 0.05), ("gripper", 7, 8, 0.04))  # fmt: skip
-"""Name, ends as `link_points` counts (8 is the TCP), radius [m]. Radii are rough; the gripper's is for a slim one."""
 
 _hulls: WeakKeyDictionary[Vessel, FloatArray] = WeakKeyDictionary()
 
@@ -112,10 +107,11 @@ def nearest_to_receiver(sampled: SampledPath, until: float, pourer: Vessel, rece
 
 def _pourer_error(sampled: SampledPath, pourer: Vessel) -> float:
     """Largest distance of a calibrated robot's pourer from where it is planned [m], by the driver's own check."""
-    if sampled.model.calibration is None:
+    place, angle = sampled.model.pose_error
+    if place == angle == 0.0:
         return 0.0
     lever = float(np.linalg.norm(cell_transforms(sampled.spec).pourer.apply(hull(pourer)), axis=-1).max())
-    return SAME_PLACE + SAME_ANGLE * lever
+    return place + angle * lever
 
 
 def nearest_links(sampled: SampledPath, receiver: Vessel | None) -> tuple[Nearest, Nearest]:
@@ -124,9 +120,9 @@ def nearest_links(sampled: SampledPath, receiver: Vessel | None) -> tuple[Neares
     world = cell_transforms(sampled.spec).world.inverse
     table, cup = [], []
     along = np.linspace(0.0, 1.0, 13)[:, None]
-    for name, first, second, radius_drawn in LINKS:
-        radius = radius_drawn + sampled.link_error
-        a, b = points[:, first, None], points[:, second, None]
+    for link in sampled.model.links:
+        name, radius = link.name, link.radius + sampled.link_error
+        a, b = points[:, link.first, None], points[:, link.second, None]
         line = a + (b - a) * along
         above = line[..., 2].min(axis=1) - radius - sampled.spec.cell.table
         table.append(Nearest(float(above.min()), int(np.argmin(above)), name))
@@ -142,28 +138,26 @@ def nearest_links(sampled: SampledPath, receiver: Vessel | None) -> tuple[Neares
 def nearest_to_itself(sampled: SampledPath, points: FloatArray) -> tuple[str, Nearest]:
     """Smallest distance of what the arm's end carries from the arm, and its name.
 
-    The carried vessel, as a cylinder, is compared with the upright part of the base, the upper arm and the forearm;
-    gripper and wrist, which are beside the forearm, with the other two.
+    The carried vessel, as a cylinder, is compared with `ArmModel.body`; links near the flange with `ArmModel.hand`.
 
     Args:
         sampled: the path.
         points: outermost points of the carried vessel, shape (V, 3) [m].
     """
     radius, height = float(np.hypot(points[:, 0], points[:, 1]).max()), float(points[:, 2].max())
-    pose, base = sampled.pourer, cell_transforms(sampled.spec).base.position
-    ends = np.concatenate([np.broadcast_to(base, sampled.links[:, :1].shape), sampled.links], axis=1)
-    links = [(name, ends[:, first + 1, None], ends[:, second + 1, None], thick) for name, first, second, thick in LINKS]
-    column = ("base", ends[:, 0, None], ends[:, 1, None], LINKS[0][3])
+    pose, ends, model = sampled.pourer, sampled.links, sampled.model
     along, coarse = (np.linspace(0.0, 1.0, count)[:, None] for count in (13, 4))
     nearest = []
-    for name, a, b, thick in (column, *links[:2]):
-        line, thickness = a + (b - a) * along, thick + 2.0 * sampled.link_error
+    for link, others in zip(model.body, model.hand, strict=True):
+        a, b = ends[:, link.first, None], ends[:, link.second, None]
+        line, thickness = a + (b - a) * along, link.radius + 2.0 * sampled.link_error
         inside = np.einsum("nji,nkj->nki", pose.rotation, line - pose.position[:, None])
         pairs = [("the carried vessel", from_cylinder(inside, radius, height).min(axis=1) - thickness)]
-        for end, c, d, slim in links[3:] if name != "forearm" else ():
+        for other in others:
+            c, d = ends[:, other.first, None], ends[:, other.second, None]
             apart = np.linalg.norm(line[:, :, None] - (c + (d - c) * coarse)[:, None], axis=-1)
-            pairs.append((f"the {end}", apart.min(axis=(1, 2)) - thickness - slim))
-        nearest += [(thing, Nearest(float(gap.min()), int(np.argmin(gap)), name)) for thing, gap in pairs]
+            pairs.append((f"the {other.name}", apart.min(axis=(1, 2)) - thickness - other.radius))
+        nearest += [(thing, Nearest(float(gap.min()), int(np.argmin(gap)), link.name)) for thing, gap in pairs]
     return min(nearest, key=lambda each: each[1].distance)
 
 

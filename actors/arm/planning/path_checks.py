@@ -14,21 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.arm_interface import PathReport
+from actors.arm.joint_arm import ArmModel, JointArmSettings
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.collision_geometry import Nearest, hull, nearest_links, nearest_to_itself, nearest_to_receiver
-from actors.arm.planning.kinematics import (
-    beyond_reach,
-    cell_transforms,
-    flange_poses,
-    flange_transforms,
-    inverse,
-    posture,
-    pourer_transforms,
-    singularities,
-)
+from actors.arm.planning.kinematics import cell_transforms, flange_poses, flange_transforms, pourer_transforms
 from actors.arm.planning.trajectory import RacingJointError, SampledPath
-from actors.arm.ur_settings import UrArmSettings
-from actors.arm_geometry import JOINT_NAMES
 from actors.interfaces import InvalidActionError
 from sim_engine.vessel.distance_grid import MARGIN
 from sim_engine.vessel.vessel import Vessel
@@ -36,11 +26,8 @@ from sim_engine.vessel.vessel import Vessel
 UPRIGHT = math.radians(3.0)
 """Largest tilt of a pourer that waits or is carried [rad], because it is full."""
 
-PARTS = ("shoulder", "elbow", "wrist")
-"""Order of the parts in `singularities`."""
 
-
-def check_limits(spec: UrArmSettings) -> list[str]:
+def check_limits(spec: JointArmSettings) -> list[str]:
     """Problems of an arm's settings; empty if there are none. Messages name the keys of a laboratory's file."""
     limits = spec.limits
     low, high = np.array(limits.box.low.vector), np.array(limits.box.high.vector)
@@ -50,7 +37,7 @@ def check_limits(spec: UrArmSettings) -> list[str]:
     return [*_speed_limits(spec), *_clearance(spec), *_receiver(spec), *_home(spec)]
 
 
-def _speed_limits(spec: UrArmSettings) -> list[str]:
+def _speed_limits(spec: JointArmSettings) -> list[str]:
     problems = []
     deg = math.degrees
     if spec.approach_speed > spec.limits.joint_speed:
@@ -66,7 +53,7 @@ def _speed_limits(spec: UrArmSettings) -> list[str]:
     return problems
 
 
-def _clearance(spec: UrArmSettings) -> list[str]:
+def _clearance(spec: JointArmSettings) -> list[str]:
     if spec.limits.clearance <= MARGIN:
         return []
     return [
@@ -75,7 +62,7 @@ def _clearance(spec: UrArmSettings) -> list[str]:
     ]
 
 
-def _receiver(spec: UrArmSettings) -> list[str]:
+def _receiver(spec: JointArmSettings) -> list[str]:
     problems = []
     x, y, z = spec.cell.receiver.vector
     low, high = spec.limits.box.low.vector, spec.limits.box.high.vector
@@ -87,30 +74,22 @@ def _receiver(spec: UrArmSettings) -> list[str]:
             problems.append(f"cell.receiver: ({x:.3f}, {y:.3f}, {z:.3f}) m lies beyond plane {number} of limits.planes")
     if z < spec.cell.table - 1e-6:
         problems.append(f"cell.receiver: stands at {z:.3f} m, below cell.table at {spec.cell.table:.3f} m")
-    model = spec.robot
-    beside = np.array([[-0.1, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0]])
-    flange = flange_poses(beside, spec)
-    if not np.isfinite(inverse(flange.rotation, flange.position, model)).any():
-        beyond = beyond_reach(flange.rotation, flange.position, model)[0]
-        least = 1e3 * float(beyond[np.argmin(np.abs(beyond))])
-        text = (
-            f"out of reach by {least:.0f} mm; move the receiver nearer to the base"
-            if least > 0.0
-            else f"{-least:.0f} mm too near to the arm's base; move the receiver away from it"
-        )
+    flange = flange_poses(np.array([[-0.1, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0]]), spec)
+    if text := spec.kinematics.place_problem(flange.rotation, flange.position):
         problems.append(
             f"cell.receiver: an upright pourer beside it, 100 mm up, is {text}, or turn 'direction' or 'grip'"
         )
     return problems
 
 
-def _home(spec: UrArmSettings) -> list[str]:
-    model, q = spec.robot, np.array([spec.home.angles])
+def _home(spec: JointArmSettings) -> list[str]:
+    model, q = spec.kinematics, np.array([spec.home_joints])
     problems = []
-    for name, angle, most in zip(JOINT_NAMES, spec.home.angles, model.joint_range, strict=True):
-        if abs(angle) > most:
+    for k, angle in enumerate(spec.home_joints):
+        if not model.joint_low[k] <= angle <= model.joint_high[k]:
             problems.append(
-                f"home: {name} at {math.degrees(angle):.1f} deg is outside its range of ±{math.degrees(most):.0f} deg"
+                f"home: {model.joint_names[k]} at {math.degrees(angle):.1f} deg is outside its range of "
+                f"{_range(model, k)}"
             )
     pourer = pourer_transforms(q, spec)
     lean = math.acos(float(np.clip(pourer.rotation[0, 2, 2], -1.0, 1.0)))
@@ -122,17 +101,16 @@ def _home(spec: UrArmSettings) -> list[str]:
     tool = flange_transforms(q, spec).apply(cell_transforms(spec).tool.position)
     for name, point in (("the tool", tool[0]), ("the pourer", pourer.position[0])):
         problems += [f"home: {name} is {text}" for text in outside(point, spec)]
-    margins = singularities(q, model)[0]
-    for path, margin in zip(PARTS, margins, strict=True):
+    for name, margin in zip(model.margin_names, model.margins(q)[0], strict=True):
         if margin < spec.limits.singularity:
             problems.append(
-                f"home: the {path} is {margin:.2f} from singular, limits.singularity asks for "
+                f"home: the {name} is {margin:.2f} from singular, limits.singularity asks for "
                 f"{spec.limits.singularity:.2f}; bend it more"
             )
     return problems
 
 
-def outside(point: np.ndarray[tuple[int], np.dtype[np.float64]], spec: UrArmSettings) -> list[str]:
+def outside(point: np.ndarray[tuple[int], np.dtype[np.float64]], spec: JointArmSettings) -> list[str]:
     """Violations of box, planes and table at a point of the room's frame, shape (3,) [m]."""
     texts = []
     for axis, value, low, high in zip(
@@ -152,14 +130,10 @@ def outside(point: np.ndarray[tuple[int], np.dtype[np.float64]], spec: UrArmSett
 FloatArray = NDArray[np.float64]
 
 SLACK = 1e-6
-"""Relative tolerance: rounding may put a path that is planned at a limit above it."""
+"""Relative tolerance of tilts: rounding may put a path that is planned at a limit above it."""
 
 TURNING_SLACK = 1e-4
 """Additional tolerance of the speed of the tilt, which is a difference of sampled poses."""
-
-CALIBRATED_SLACK = 5e-3
-"""The same for speeds of a calibrated robot, whose axes are turned by some mrad: a path that keeps a limit with nominal
-lengths is up to 0.13 % above it (twenty robots with deviations of 2 mrad and 1 mm at each joint)."""
 
 THROUGH = 0.02
 """Below this distance from a singularity a path counts as passing through it when speeds are checked."""
@@ -231,24 +205,15 @@ def check_clearance(sampled: SampledPath, until: float, pourer: Vessel, receiver
 
 def check_reach(unreached: SampledPath) -> str:
     """Message about a path of which some poses cannot be reached in the posture of home."""
-    home = posture(np.array(unreached.spec.home.angles), unreached.model)
     assert unreached.unreached is not None
-    beyond = beyond_reach(unreached.unreached.rotation, unreached.unreached.position, unreached.model)
-    worst = _first_worst(np.abs(beyond[:, home]))
-    # an impossible path has no times yet
-    when = "on the way from home" if unreached.name == "approach" else unreached.when(worst)
-    distance = 1e3 * float(beyond[worst, home])
-    another = (
-        "; another posture of the arm would reach it: wait at a 'home' with the wrist bent the other way"
-        if np.any(np.all(beyond == 0.0, axis=0))
-        else ""
+    worst, text = unreached.model.out_of_reach(
+        unreached.unreached.rotation, unreached.unreached.position, np.array(unreached.spec.home_joints)
     )
-    if distance > 0.0:
-        return f"{when}: out of the arm's reach by {distance:.0f} mm; move the receiver nearer or lower{another}"
-    return f"{when}: {-distance:.0f} mm too near to the arm's base; move the receiver away from it{another}"
+    # an impossible path has no times yet
+    return f"{'on the way from home' if unreached.name == 'approach' else unreached.when(worst)}: {text}"
 
 
-def check_way(racing: RacingJointError, spec: UrArmSettings) -> str:
+def check_way(racing: RacingJointError, spec: JointArmSettings) -> str:
     """Message about a way from home through a singularity."""
     direction = math.degrees(spec.cell.direction)
     facing = math.degrees(math.remainder(spec.cell.direction + racing.heading, 2.0 * math.pi))
@@ -261,8 +226,9 @@ def check_way(racing: RacingJointError, spec: UrArmSettings) -> str:
     )
     cure = f"set cell.direction nearer to {facing:.0f} deg, or wait at a 'home' nearer to the pour"
     return (
-        f"{why}, through a place where two joints turn about one axis and {JOINT_NAMES[racing.joint]} would have to "
-        f"race; {cure if turned >= 1.0 else 'move the receiver, or let the arm wait elsewhere'}"
+        f"{why}, through a place where two joints turn about one axis and "
+        f"{spec.kinematics.joint_names[racing.joint]} would "
+        f"have to race; {cure if turned >= 1.0 else 'move the receiver, or let the arm wait elsewhere'}"
     )
 
 
@@ -285,6 +251,7 @@ def report(parts: list[SampledPath], clearance: float, pourer: Vessel, deviation
     return PathReport(
         joint_speed=float(joint_speeds.max()),
         fastest_joint=int(np.argmax(joint_speeds)),
+        joint_name=parts[0].model.joint_names[int(np.argmax(joint_speeds))],
         tool_speed=max(float(s.point_speeds(points).max()) for s in parts),
         tilt=max(float(s.tilts.max()) for s in parts),
         tilt_speed=max(float(s.turning.max()) for s in parts),
@@ -297,7 +264,7 @@ def report(parts: list[SampledPath], clearance: float, pourer: Vessel, deviation
     )
 
 
-def recheck(path: JointPath, spec: UrArmSettings) -> None:
+def recheck(path: JointPath, spec: JointArmSettings) -> None:
     """Check a path again immediately before it is executed, without information about its purpose.
 
     Checks ranges, joint speeds and jumps; tool centre point and the pourer's underside against box, planes and table.
@@ -306,16 +273,19 @@ def recheck(path: JointPath, spec: UrArmSettings) -> None:
         InvalidActionError: the path must not be executed; the text lists all problems.
     """
     times, joints = path.times, path.joints
-    if times.ndim != 1 or len(times) < 2 or joints.shape != (len(times), 6):
-        raise InvalidActionError("the path has no two waypoints of six joints each")
+    count = len(spec.home_joints)
+    if times.ndim != 1 or len(times) < 2 or joints.shape != (len(times), count):
+        raise InvalidActionError(f"the path has no two waypoints of {count} joints each")
     if not (np.isfinite(times).all() and np.isfinite(joints).all()) or times[0] != 0.0 or np.any(np.diff(times) <= 0):
         raise InvalidActionError("the path's times should increase from 0, and all its numbers be finite")
     problems = []
     jumps = np.abs(np.diff(joints, axis=0))
     if jumps.max() > LARGEST_STEP:
-        row, joint = divmod(int(np.argmax(jumps)), 6)
+        row, joint = divmod(int(np.argmax(jumps)), count)
         degrees = math.degrees(jumps.max())
-        problems.append(f"{JOINT_NAMES[joint]} would jump by {degrees:.0f} deg, {times[row]:.2f} s into the path")
+        problems.append(
+            f"{spec.kinematics.joint_names[joint]} would jump by {degrees:.0f} deg, {times[row]:.2f} s into the path"
+        )
     sampled = SampledPath.of("path", path, spec)
     problems += [*_ranges(sampled), *_joint_speeds(sampled), *_places(sampled, np.zeros((1, 3)))]
     if problems:
@@ -335,19 +305,24 @@ def _first_worst(values: FloatArray) -> int:
     return int(np.argmax(values >= most - 1e-6 * abs(most) - 1e-9))
 
 
+def _range(model: ArmModel, joint: int) -> str:
+    low, high = math.degrees(model.joint_low[joint]), math.degrees(model.joint_high[joint])
+    return f"±{high:.0f} deg" if low == -high else f"{low:.0f} … {high:.0f} deg"
+
+
 def _ranges(s: SampledPath) -> Iterator[str]:
-    for k, (name, most) in enumerate(zip(JOINT_NAMES, s.model.joint_range, strict=True)):
-        worst = _first_worst(np.abs(s.joints[:, k]))
-        angle = float(s.joints[worst, k])
-        if abs(angle) > most:
+    for k, name in enumerate(s.model.joint_names):
+        beyond = np.maximum(s.model.joint_low[k] - s.joints[:, k], s.joints[:, k] - s.model.joint_high[k])
+        worst = _first_worst(beyond)
+        if beyond[worst] > 0.0:
             yield (
-                f"{name} would turn to {math.degrees(angle):.1f} deg, {s.when(worst)}; its range is "
-                f"±{math.degrees(most):.0f} deg: let it start a full turn back at 'home'"
+                f"{name} would turn to {math.degrees(float(s.joints[worst, k])):.1f} deg, {s.when(worst)}; its range "
+                f"is {_range(s.model, k)}: {s.model.range_remedy}"
             )
 
 
 def _joint_speeds(s: SampledPath) -> Iterator[str]:
-    for k, (name, fastest) in enumerate(zip(JOINT_NAMES, s.model.joint_speed, strict=True)):
+    for k, (name, fastest) in enumerate(zip(s.model.joint_names, s.model.joint_speed, strict=True)):
         most = min(fastest, s.spec.limits.joint_speed)
         worst = _first_worst(s.joint_speeds[:, k])
         speed = float(s.joint_speeds[worst, k])
@@ -360,7 +335,7 @@ def _joint_speeds(s: SampledPath) -> Iterator[str]:
 
 def _tolerated(s: SampledPath) -> float:
     """Factor of a speed limit that a path may reach."""
-    return 1.0 + (SLACK if s.spec.calibration is None else CALIBRATED_SLACK)
+    return 1.0 + s.model.speed_slack
 
 
 def _slower(s: SampledPath, limit: str | None) -> str:
@@ -370,29 +345,8 @@ def _slower(s: SampledPath, limit: str | None) -> str:
 
 
 def _singular(s: SampledPath, cure: str = MOVE) -> Iterator[str]:
-    least = s.spec.limits.singularity
-    worst = np.argmin(s.margins, axis=0)
-    margins = s.margins[worst, np.arange(3)]
-    reach = abs(s.model.a2) + abs(s.model.a3)
-    shoulder, elbow, wrist = margins
-    if shoulder < least:
-        yield (
-            f"{s.when(worst[0])}: the wrist {1e3 * shoulder * reach:.0f} mm from above the base's axis, "
-            f"{1e3 * least * reach:.0f} mm are asked for; {cure} away from the base"
-        )
-    wanted = math.degrees(math.asin(least))
-    if elbow < least:
-        folded = math.cos(float(s.joints[worst[1], 2])) < 0.0
-        state, help_ = ("folded", "away from the base") if folded else ("straight", "nearer or lower")
-        yield (
-            f"{s.when(worst[1])}: elbow {math.degrees(math.asin(elbow)):.1f} deg from {state}, {wanted:.1f} deg are "
-            f"asked for; {cure} {help_}"
-        )
-    if wrist < least:
-        yield (
-            f"{s.when(worst[2])}: wrist 2 {math.degrees(math.asin(wrist)):.1f} deg from where joints 4 and 6 turn "
-            f"about one axis, {wanted:.1f} deg are asked for; turn 'direction', or {cure} sideways"
-        )
+    for index, text in s.model.singular(s.joints, s.spec.limits.singularity, cure):
+        yield f"{s.when(index)}: {text}"
 
 
 def _speeds(s: SampledPath, points: FloatArray) -> Iterator[str]:

@@ -22,9 +22,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.arm.joint_arm import JointArmSettings
 from actors.arm.planned_pour import JointPath, PlaceWay, PourPath
-from actors.arm.planning.collision_geometry import LINKS, from_cylinder, hull
-from actors.arm.planning.kinematics import Transforms, beyond_reach, cell_transforms, posture, quaternions, transform_of
+from actors.arm.planning.collision_geometry import from_cylinder, hull
+from actors.arm.planning.kinematics import Transforms, cell_transforms, flange_poses, quaternions, transform_of
 from actors.arm.planning.path_checks import UPRIGHT, check_way_limits, outside
 from actors.arm.planning.trajectory import (
     TOOL_ACCELERATION,
@@ -36,7 +37,6 @@ from actors.arm.planning.trajectory import (
     routes,
     travel,
 )
-from actors.arm.ur_settings import UrArmSettings
 from actors.interfaces import InvalidActionError
 from actors.places import PlaceSettings
 from sim_engine.hydrostatics import GRAVITY, level
@@ -94,12 +94,12 @@ def full_acceleration(vessel: Vessel, volume: float) -> float:
     return min(TOOL_ACCELERATION, GRAVITY * freeboard / (SWINGS * vessel.opening_radius))
 
 
-def vessel_at(place: PlaceSettings, spec: UrArmSettings) -> Transforms:
+def vessel_at(place: PlaceSettings, spec: JointArmSettings) -> Transforms:
     """Frame of a vessel that stands at a place, in the room's frame."""
     return cell_transforms(spec).base @ transform_of(place.pose) @ transform_of(spec.grip)
 
 
-def standing_at(place: PlaceSettings, vessels: Mapping[str, Vessel], spec: UrArmSettings) -> Standing:
+def standing_at(place: PlaceSettings, vessels: Mapping[str, Vessel], spec: JointArmSettings) -> Standing:
     """The largest of the vessels that may stand at a place."""
     standing = [vessels[role] for role in place.holds if role in vessels]
     x, y, z = map(float, vessel_at(place, spec).position)
@@ -110,7 +110,7 @@ def standing_at(place: PlaceSettings, vessels: Mapping[str, Vessel], spec: UrArm
 @functools.lru_cache(maxsize=512)
 def plan_way(
     place: PlaceSettings,
-    spec: UrArmSettings,
+    spec: JointArmSettings,
     carried: tuple[Vessel, ...],
     others: tuple[Standing, ...],
     fastest: float = TOOL_SPEED,
@@ -143,7 +143,7 @@ def plan_way(
     way_problems: list[str] = []
     for knots in routes(start, above, over):
         try:
-            path = travel([*knots, end], np.array(spec.home.angles), spec, fastest, hardest)
+            path = travel([*knots, end], np.array(spec.home_joints), spec, fastest, hardest)
         except OutOfReachError as error:
             way_problems = [_unreached(error, spec)]
             continue
@@ -161,13 +161,13 @@ def plan_way(
     if best is None or best[1]:
         problems = way_problems if best is None else best[1]
         raise InvalidActionError(f"place '{place.name}': " + "; ".join(problems))
-    return PlaceWay(place.name, best[0], spec.robot.parameters.checksum)
+    return PlaceWay(place.name, best[0], spec.kinematics.checksum)
 
 
 def way_to(
     place: PlaceSettings,
     places: Sequence[PlaceSettings],
-    spec: UrArmSettings,
+    spec: JointArmSettings,
     vessels: Mapping[str, Vessel],
     volume: float | None,
 ) -> PlaceWay:
@@ -200,7 +200,11 @@ def way_to(
 
 
 def in_the_way(
-    path: PourPath, pourer: Vessel, places: Sequence[PlaceSettings], spec: UrArmSettings, vessels: Mapping[str, Vessel]
+    path: PourPath,
+    pourer: Vessel,
+    places: Sequence[PlaceSettings],
+    spec: JointArmSettings,
+    vessels: Mapping[str, Vessel],
 ) -> list[str]:
     """Problems of a pour over the balance with vessels that may stand at the other places.
 
@@ -221,14 +225,10 @@ def in_the_way(
     ]
 
 
-def _unreached(error: OutOfReachError, spec: UrArmSettings) -> str:
-    flange = SampledPath.beyond("way", np.arange(float(len(error.poses))), error.poses, spec).unreached
-    assert flange is not None
-    beyond = beyond_reach(flange.rotation, flange.position, spec.robot)
-    apart = beyond[:, posture(np.array(spec.home.angles), spec.robot)]
-    worst = float(apart[int(np.argmax(np.abs(apart)))])
-    how = f"out of the arm's reach by {1e3 * worst:.0f} mm" if worst > 0.0 else "too near to the arm's base"
-    return f"{how}, on the way from home in the posture of home"
+def _unreached(error: OutOfReachError, spec: JointArmSettings) -> str:
+    flange = flange_poses(error.poses, spec)
+    _, text = spec.kinematics.out_of_reach(flange.rotation, flange.position, np.array(spec.home_joints))
+    return f"{text.partition(';')[0]}, on the way from home in the posture of home"
 
 
 def standing_problems(
@@ -252,18 +252,18 @@ def standing_problems(
             if apart.min() < each.clearance:
                 when = sampled.when(int(near[np.argmin(apart)]))
                 yield _too_near("the carried vessel", float(apart.min()), each, when)
-        for name, first, second, radius in LINKS:
-            if each.place == own and name in ("gripper", "wrist"):
+        for link in sampled.model.links:
+            if each.place == own and link in sampled.model.hand[0]:
                 continue
-            a, b = sampled.links[:, first, None], sampled.links[:, second, None]
-            thick, length = radius + sampled.link_error, np.linalg.norm(b - a, axis=-1)
+            a, b = sampled.links[:, link.first, None], sampled.links[:, link.second, None]
+            thick, length = link.radius + sampled.link_error, np.linalg.norm(b - a, axis=-1)
             near = np.flatnonzero((_distance(a, each) - length)[:, 0] < thick + each.clearance)
             if not near.size:
                 continue
             apart = _distance(a[near] + (b[near] - a[near]) * along, each).min(axis=1) - thick
             if apart.min() < each.clearance:
                 when = sampled.when(int(near[np.argmin(apart)]))
-                yield _too_near(f"the {name}", float(apart.min()), each, when)
+                yield _too_near(f"the {link.name}", float(apart.min()), each, when)
                 break
 
 
@@ -284,7 +284,7 @@ def _gap(distance: float) -> str:
 
 def place_problems(
     places: Sequence[PlaceSettings],
-    spec: UrArmSettings,
+    spec: JointArmSettings,
     vessels: Mapping[str, Vessel],
     opened: Mapping[str, float] = {},
 ) -> Iterator[tuple[int, str]]:

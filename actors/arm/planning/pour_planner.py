@@ -11,6 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.arm.joint_arm import JointArmSettings
 from actors.arm.planned_pour import JointPath, PourPath
 from actors.arm.planning.path_checks import (
     check_clearance,
@@ -35,7 +36,6 @@ from actors.arm.planning.trajectory import (
     routes,
     travel,
 )
-from actors.arm.ur_settings import UrArmSettings
 from actors.interfaces import InvalidActionError, UnreachablePlaceError
 from sim_engine.collision import rotations
 from sim_engine.motion import Phase, PourMotion, turn
@@ -59,7 +59,7 @@ UNTILT_ACCELERATION = STEEPEST / 10.0
 """Acceleration of the return to upright after a pour that ends tilted [rad/s²]."""
 
 
-def plan_path(motion: PourMotion, spec: UrArmSettings, pourer: Vessel, receiver: Vessel) -> PourPath:
+def plan_path(motion: PourMotion, spec: JointArmSettings, pourer: Vessel, receiver: Vessel) -> PourPath:
     """Plan the joints for a whole pour.
 
     The arm moves from home to the pour's first pose in straight lines with the pourer upright: directly, or, if that is
@@ -94,7 +94,7 @@ def plan_path(motion: PourMotion, spec: UrArmSettings, pourer: Vessel, receiver:
     barred = bool(problems)
     pour = None
     try:
-        pour = _pour(executed, np.array(spec.home.angles) if approach is None else approach.joints[-1], spec)
+        pour = _pour(executed, np.array(spec.home_joints) if approach is None else approach.joints[-1], spec)
         during = SampledPath.of("pour", pour, spec, phases)
     except OutOfReachError as error:
         during = SampledPath.beyond("pour", pour_times(executed), error.poses, spec, phases)
@@ -129,13 +129,13 @@ def plan_path(motion: PourMotion, spec: UrArmSettings, pourer: Vessel, receiver:
             pourer,
             _deviation(motion, executed),
         ),
-        calibration=spec.robot.parameters.checksum,
+        calibration=spec.kinematics.checksum,
     )
 
 
 @lru_cache(maxsize=16)
 def _approach(
-    start: tuple[float, ...], spec: UrArmSettings, pourer: Vessel, receiver: Vessel
+    start: tuple[float, ...], spec: JointArmSettings, pourer: Vessel, receiver: Vessel
 ) -> tuple[JointPath | None, float, tuple[str, ...]]:
     """The approach with the fewest problems, and the shortest of those, its clearance [m], and its problems.
 
@@ -150,7 +150,7 @@ def _approach(
     for knots in routes(home_pose(spec), np.array(start), over):
         path: JointPath | None = None
         try:
-            path = travel(knots, np.array(spec.home.angles), spec)
+            path = travel(knots, np.array(spec.home_joints), spec)
             sampled = SampledPath.of("approach", path, spec)
         except OutOfReachError as error:
             sampled = SampledPath.beyond(
@@ -171,7 +171,7 @@ def _approach(
     return best[0], best[1], tuple(best[2])
 
 
-def _pour(motion: PourMotion, near: FloatArray, spec: UrArmSettings) -> JointPath:
+def _pour(motion: PourMotion, near: FloatArray, spec: JointArmSettings) -> JointPath:
     """Follow the motion within the allowed errors, with as few waypoints as possible."""
     finer = 1
     while True:
@@ -182,7 +182,7 @@ def _pour(motion: PourMotion, near: FloatArray, spec: UrArmSettings) -> JointPat
         finer *= 2
 
 
-def _follows(path: JointPath, motion: PourMotion, spec: UrArmSettings) -> bool:
+def _follows(path: JointPath, motion: PourMotion, spec: JointArmSettings) -> bool:
     middles = 0.5 * (path.times[1:] + path.times[:-1])
     wanted = motion.sample(middles)
     world = SampledPath("pour", middles, path.at(middles), spec)
@@ -191,7 +191,7 @@ def _follows(path: JointPath, motion: PourMotion, spec: UrArmSettings) -> bool:
     return bool(apart.max() < PLACE_ERROR and turned.max() < ANGLE_ERROR)
 
 
-def _retreat(motion: PourMotion, approach: JointPath, pour: JointPath, spec: UrArmSettings) -> JointPath:
+def _retreat(motion: PourMotion, approach: JointPath, pour: JointPath, spec: JointArmSettings) -> JointPath:
     """First to upright, if the pour ends tilted; then back along the approach."""
     times = approach.times[-1] - approach.times[::-1]
     back = JointPath(times, approach.joints[::-1])

@@ -17,6 +17,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.arm.joint_arm import ArmModel, JointArmSettings, UnreachedError
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.kinematics import (
     Transforms,
@@ -24,17 +25,9 @@ from actors.arm.planning.kinematics import (
     cell_transforms,
     flange_poses,
     flange_transforms,
-    forward,
-    inverse,
-    link_points,
-    posture,
     pourer_transforms,
     quaternions,
-    refined,
-    singularities,
 )
-from actors.arm.ur.robot_models import SAME_PLACE, RobotModel
-from actors.arm.ur_settings import UrArmSettings
 from sim_engine.motion import Phase, PourMotion, Segment, turn
 
 FloatArray = NDArray[np.float64]
@@ -156,7 +149,7 @@ class SampledPath:
     Attributes:
         name: one of these.
         times: (N,) of waypoints, and of midpoints between them [s].
-        joints: (N, 6) [rad]; meaningless if `unreached` is set.
+        joints: (N, n) [rad]; meaningless if `unreached` is set.
         spec: of the arm and its cell.
         phases: of a pour: name, start and end [s]; empty otherwise.
         unreached: flange in the base's frame, if the arm cannot reach some of the poses.
@@ -165,43 +158,39 @@ class SampledPath:
     name: str
     times: FloatArray
     joints: FloatArray
-    spec: UrArmSettings
+    spec: JointArmSettings
     phases: Phases = ()
     unreached: Transforms | None = None
 
     @classmethod
-    def of(cls, name: str, path: JointPath, spec: UrArmSettings, phases: Phases = ()) -> SampledPath:
+    def of(cls, name: str, path: JointPath, spec: JointArmSettings, phases: Phases = ()) -> SampledPath:
         """A path with midpoints between its waypoints: joints are linear in between, poses nearly so."""
         times = np.sort(np.concatenate([path.times, 0.5 * (path.times[1:] + path.times[:-1])]))
         return cls(name, times, path.at(times), spec, phases)
 
     @classmethod
     def beyond(
-        cls, name: str, times: FloatArray, poses: FloatArray, spec: UrArmSettings, phases: Phases = ()
+        cls, name: str, times: FloatArray, poses: FloatArray, spec: JointArmSettings, phases: Phases = ()
     ) -> SampledPath:
         """Poses of the pourer in the world (N, 7), some of which cannot be reached."""
-        return cls(name, times, np.zeros((len(times), 6)), spec, phases, flange_poses(poses, spec))
+        return cls(name, times, np.zeros((len(times), len(spec.home_joints))), spec, phases, flange_poses(poses, spec))
 
     @cached_property
     def links(self) -> FloatArray:
-        """Points along the arm, see `link_points`, and its TCP; room frame, shape (N, 9, 3) [m]."""
-        points = link_points(self.joints, self.model)
+        """Points of the arm's capsules, and its TCP; room frame, shape (N, P + 1, 3) [m]."""
+        points = self.model.points(self.joints)
         room = cell_transforms(self.spec).base.apply(points.reshape(-1, 3)).reshape(points.shape)
         return np.concatenate([room, self.tool[:, None]], axis=1)
 
     @property
-    def model(self) -> RobotModel:
-        """The robot."""
-        return self.spec.robot
+    def model(self) -> ArmModel:
+        """The arm's kinematics."""
+        return self.spec.kinematics
 
     @cached_property
     def link_error(self) -> float:
-        """Largest distance of a link from where `links` has it [m]: drawn with nominal lengths, it differs from a
-        calibrated robot by no more than the flange does."""
-        if self.model.calibration is None:
-            return 0.0
-        nominal, calibrated = (forward(self.joints, model)[1] for model in (self.model.nominal, self.model))
-        return SAME_PLACE + float(np.linalg.norm(nominal - calibrated, axis=-1).max())
+        """Largest distance of a link from where `links` has it [m]."""
+        return self.model.link_error(self.joints)
 
     @cached_property
     def flange(self) -> Transforms:
@@ -238,7 +227,7 @@ class SampledPath:
 
     @cached_property
     def joint_speeds(self) -> FloatArray:
-        """Between two samples, shape (N − 1, 6), ≥ 0 [rad/s]."""
+        """Between two samples, shape (N − 1, n), ≥ 0 [rad/s]."""
         speeds: FloatArray = np.abs(np.diff(self.joints, axis=0)) / self.steps[:, None]
         return speeds
 
@@ -252,8 +241,8 @@ class SampledPath:
 
     @cached_property
     def margins(self) -> FloatArray:
-        """Distances from singularities: shoulder, elbow, wrist, shape (N, 3)."""
-        return singularities(self.joints, self.model)
+        """Distances from singularities, shape (N, m), see `ArmModel.margins`."""
+        return self.model.margins(self.joints)
 
     def point_speeds(self, points: FloatArray) -> FloatArray:
         """Largest speed of the TCP and of points (V, 3) of the pourer between samples, shape (N − 1,) [m/s]."""
@@ -313,7 +302,7 @@ class OutOfReachError(Exception):
 
     Attributes:
         poses: (T, 7) of the pourer in the world.
-        nominal: joints of an arm with nominal lengths (T, 6) [rad], which reaches them all; the lengths of this arm
+        nominal: joints of an arm with nominal lengths (T, n) [rad], which reaches them all; the lengths of this arm
             give no joints near a singularity. None if that one cannot reach them either.
     """
 
@@ -322,33 +311,30 @@ class OutOfReachError(Exception):
         self.poses, self.nominal = poses, nominal
 
 
-def follow(poses: FloatArray, near: FloatArray, spec: UrArmSettings) -> FloatArray:
+def follow(poses: FloatArray, near: FloatArray, spec: JointArmSettings) -> FloatArray:
     """Joints that take the pourer through poses without jumps, in the posture of home.
 
     Args:
         poses: of the pourer in the world, shape (T, 7); the first one is close to the pose of `near`.
-        near: joints before the first pose, shape (6,) [rad], which determine the full turns.
+        near: joints before the first pose, shape (n,) [rad], which determine the full turns.
         spec: of the arm and its cell.
 
     Returns:
-        Shape (T, 6) [rad]; joints may leave their ranges.
+        Shape (T, n) [rad]; joints may leave their ranges.
 
     Raises:
         OutOfReachError: some poses cannot be reached.
     """
-    model = spec.robot
     flange = flange_poses(poses, spec)
-    number = posture(np.array(spec.home.angles), model)
-    nominal = inverse(flange.rotation, flange.position, model.nominal)[:, number]
-    joints = refined(nominal, flange.rotation, flange.position, model)
-    if np.isnan(joints).any():
-        raise OutOfReachError(poses, None if np.isnan(nominal).any() else nominal)
-    return np.unwrap(np.concatenate([near[None], joints]), axis=0)[1:]
+    try:
+        return spec.kinematics.follow(flange.rotation, flange.position, near, np.array(spec.home_joints))
+    except UnreachedError as error:
+        raise OutOfReachError(poses, error.nominal) from None
 
 
-def home_pose(spec: UrArmSettings) -> FloatArray:
+def home_pose(spec: JointArmSettings) -> FloatArray:
     """Pose of the pourer in the world at the home pose, shape (7,)."""
-    frame = cell_transforms(spec).world.inverse @ pourer_transforms(np.array([spec.home.angles]), spec)
+    frame = cell_transforms(spec).world.inverse @ pourer_transforms(np.array([spec.home_joints]), spec)
     return np.concatenate([frame.position[0], quaternions(frame.rotation)[0]])
 
 
@@ -368,7 +354,7 @@ def routes(start: FloatArray, end: FloatArray, over: float) -> list[list[FloatAr
 def travel(
     knots: list[FloatArray],
     near: FloatArray,
-    spec: UrArmSettings,
+    spec: JointArmSettings,
     fastest: float = TOOL_SPEED,
     hardest: float = TOOL_ACCELERATION,
 ) -> JointPath:
@@ -408,7 +394,7 @@ def _line(
     distance: float,
     angle: float,
     near: FloatArray,
-    spec: UrArmSettings,
+    spec: JointArmSettings,
     fastest: float,
     hardest: float,
 ) -> tuple[FloatArray, FloatArray]:

@@ -14,7 +14,8 @@ import numpy as np
 
 from actors.arm.arm_interface import FULL_SPEED
 from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath
-from actors.arm.planning.kinematics import cell_transforms, forward, pourer_motion
+from actors.arm.planning.kinematics import cell_transforms, pourer_motion
+from actors.arm.ur.ur_kinematics import forward
 from actors.arm.ur.worker_messages import ForceSample, MotionOutcome, Sample
 from actors.arm.ur_settings import UrArmSettings
 

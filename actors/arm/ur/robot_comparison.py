@@ -11,10 +11,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from actors.arm.planning.kinematics import forward, transform_of
+from actors.arm.planning.kinematics import transform_of
 from actors.arm.planning.trajectory import STEEPEST
 from actors.arm.ur.primary_interface import RobotState
 from actors.arm.ur.robot_models import SAME_ANGLE, SAME_PLACE, model_named, same_robot
+from actors.arm.ur.ur_kinematics import forward
 from actors.arm.ur_settings import UrArmSettings
 from actors.arm_geometry import JOINT_NAMES, Pose
 from actors.interfaces import DeviceCheck

@@ -29,12 +29,13 @@ from actors.arm.arm_interface import (
     NotAcceptedError,
 )
 from actors.arm.planned_pour import ExecutedPath, FloatArray, PlaceWay, PourPath
-from actors.arm.planning.kinematics import cell_transforms, forward
+from actors.arm.planning.kinematics import cell_transforms
+from actors.arm.planning.motion_segments import MotionSegment, jog_path, upright_way, way_home
 from actors.arm.planning.path_checks import recheck
 from actors.arm.ur.dashboard import DashboardError, stop_program
 from actors.arm.ur.executed_motion import Stops, StopTimes, executed_dose, executed_path
-from actors.arm.ur.motion_segments import MotionSegment, jog_path, upright_way, way_home
 from actors.arm.ur.robot_comparison import payload_check
+from actors.arm.ur.ur_kinematics import forward
 from actors.arm.ur.ur_session import ANSWER_TIME, Session, UrFacts
 from actors.arm.ur.urscript_writer import TiltLimits, path_program, tilt_program
 from actors.arm.ur.worker_messages import (

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from actors.arm.arm_interface import NEWS_TIMEOUT, ArmRefusedError
-from actors.arm.planned_pour import FloatArray, JointPath
+from actors.arm.planned_pour import FloatArray, JointPath, checked
 from actors.arm.ur.worker_messages import (
     CLOCK,
     DONE,
@@ -87,24 +87,6 @@ def thinned(path: JointPath, tolerance: float = THINNING) -> JointPath:
     return JointPath(times[indices], joints[indices])
 
 
-def checked(path: JointPath) -> JointPath:
-    """Check that a program can be made from a path. Returns the path.
-
-    Raises:
-        ArmRefusedError: its shape, its times or its numbers are invalid.
-    """
-    times, joints = np.asarray(path.times, dtype=float), np.asarray(path.joints, dtype=float)
-    if times.ndim != 1 or len(times) < 2 or joints.shape != (len(times), 6):
-        raise ArmRefusedError(
-            f"a path has two or more times and six joints for each, not {times.shape} and {joints.shape}"
-        )
-    if not (np.all(np.isfinite(times)) and np.all(np.isfinite(joints))):
-        raise ArmRefusedError("a path must be made of finite numbers")
-    if times[0] != 0.0 or np.any(np.diff(times) <= 0.0):
-        raise ArmRefusedError("a path's times must begin at 0 and increase")
-    return JointPath(times, joints)
-
-
 def path_program(path: JointPath, settings: MotionSettings, number: int, *, cb3: bool) -> str:
     """A program that moves the arm along a path.
 
@@ -117,7 +99,7 @@ def path_program(path: JointPath, settings: MotionSettings, number: int, *, cb3:
     Raises:
         ArmRefusedError: there are too many points, or the path is invalid.
     """
-    points = thinned(checked(path))
+    points = thinned(checked(path, 6))
     if len(points.times) > MOST_POINTS:
         raise ArmRefusedError(f"the path has {len(points.times)} points; a program takes {MOST_POINTS}")
     legs = [f"  d_leg({t:.6f}, {_list(q)})" for t, q in zip(points.times[1:], points.joints[1:], strict=True)]
@@ -194,7 +176,7 @@ def tilt_program(
     Raises:
         ArmRefusedError: there are too many points, or the path is invalid.
     """
-    points = thinned(checked(JointPath(np.asarray(tilts, dtype=float) - tilts[0], joints)))
+    points = thinned(checked(JointPath(np.asarray(tilts, dtype=float) - tilts[0], joints), 6))
     if len(points.times) > MOST_POINTS:
         raise ArmRefusedError(f"the path has {len(points.times)} points; a program takes {MOST_POINTS}")
     end = float(points.times[-1])

@@ -15,8 +15,8 @@ from actors.arm.arm_device import DeviceArm
 from actors.arm.arm_interface import ArmLostError, ArmNotReleasedError, ArmStoppedError
 from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord
 from actors.arm.planned_pour import MotionPath
+from actors.arm.pour_feasibility import plan_pour
 from actors.arm.simulated_arm import POSITION_NOISE, Grip, SimulatedArm, SimulatedArmSettings
-from actors.bench.pour_feasibility import plan_pour
 from actors.contract_tests.arm_contract import ArmBench, ArmContract
 from actors.device_kinds import SimulatedArmKind
 from actors.runtime.remote_object import LocalDevice, RayDevice

@@ -9,8 +9,8 @@ import asyncio
 import numpy as np
 import pytest
 
+from actors.arm.planned_pour import slipped
 from actors.arm.simulated_arm import SimulatedArmSettings
-from actors.bench.virtual_bench import slipped
 from actors.interfaces import UnknownPourError
 from sim_engine.action import DEG
 from sim_engine.scene import SampledMotion

@@ -13,8 +13,8 @@ import pytest
 from ruamel.yaml import YAML
 
 from actors.arm.arm_settings import ArmSettings, arm_kind
+from actors.arm.pour_feasibility import vessel
 from actors.arm.ur_settings import UrArmSettings
-from actors.bench.pour_feasibility import vessel
 from actors.interfaces import InvalidActionError
 from actors.places import PlaceSettings
 from orchestrator.campaigns.campaign_checks import check_campaign

@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from actors.arm.planning.kinematics import MODELS, beyond_reach, forward, inverse, link_points, posture, singularities
+from actors.arm.ur.ur_kinematics import MODELS, beyond_reach, forward, inverse, link_points, posture, singularities
 from actors.emulators.ur_controller.robot import MODELS as CONTROLLED
 from actors.emulators.ur_controller.robot import calibrated
 from actors.emulators.ur_controller.robot_kinematics import Kinematics

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.arm.planning.kinematics import MODELS, flange_poses, inverse, pourer_motion, pourer_transforms, quaternions
+from actors.arm.planning.kinematics import flange_poses, pourer_motion, pourer_transforms, quaternions
 from actors.arm.planning.pour_planner import plan_path
+from actors.arm.ur.ur_kinematics import MODELS, inverse
 from actors.arm_geometry import Pose
 from sim_engine.action import DEG
 from sim_engine.collision import rotations

@@ -14,13 +14,14 @@ import pytest
 from pydantic import ValidationError
 from ruamel.yaml import YAML
 
-from actors.arm.planning.kinematics import forward, transform_of
+from actors.arm.planning.kinematics import transform_of
 from actors.arm.planning.place_ways import FULL_SPEED, SWINGS, full_acceleration, place_problems, way_to
 from actors.arm.planning.trajectory import TOOL_ACCELERATION, SampledPath
+from actors.arm.pour_feasibility import vessel
 from actors.arm.ur.robot_models import MODELS
+from actors.arm.ur.ur_kinematics import forward
 from actors.arm.ur_settings import UrArmSettings
 from actors.arm_geometry import Pose
-from actors.bench.pour_feasibility import vessel
 from actors.bench.vessel_handling import check_handling, plan_back
 from actors.grippers.gripper_interface import GRIPPERS
 from actors.interfaces import InvalidActionError

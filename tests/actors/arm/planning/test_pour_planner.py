@@ -10,10 +10,11 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from actors.arm.planned_pour import JointPath, PourPath
-from actors.arm.planning.kinematics import MODELS, cell_transforms, forward, pourer_motion, pourer_transforms
+from actors.arm.planning.kinematics import cell_transforms, pourer_motion, pourer_transforms
 from actors.arm.planning.path_checks import recheck
 from actors.arm.planning.pour_planner import plan_path
 from actors.arm.planning.trajectory import STEEPEST, TOOL_ACCELERATION
+from actors.arm.ur.ur_kinematics import MODELS, forward
 from actors.arm.ur_settings import UrArmSettings
 from actors.arm_geometry import Plane, Point
 from actors.interfaces import InvalidActionError

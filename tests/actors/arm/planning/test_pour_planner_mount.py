@@ -7,17 +7,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from actors.arm.planning.kinematics import (
-    MODELS,
-    cell_transforms,
-    flange_poses,
-    inverse,
-    pourer_motion,
-    pourer_transforms,
-    singularities,
-)
+from actors.arm.planning.kinematics import cell_transforms, flange_poses, pourer_motion, pourer_transforms
 from actors.arm.planning.path_checks import check_limits
 from actors.arm.planning.pour_planner import plan_path
+from actors.arm.ur.ur_kinematics import MODELS, inverse, singularities
 from actors.arm.ur_settings import UrArmSettings
 from actors.arm_geometry import Box, JointAngles, Mount, Point, RobotCell
 from actors.interfaces import InvalidActionError

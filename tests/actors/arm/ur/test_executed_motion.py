@@ -13,8 +13,8 @@ import pytest
 
 from actors.arm.arm_interface import ArmStoppedError
 from actors.arm.planning.kinematics import pourer_motion
+from actors.arm.planning.motion_segments import leans
 from actors.arm.planning.pour_planner import plan_path
-from actors.arm.ur.motion_segments import leans
 from actors.arm.ur.ur_driver import UrArm
 from actors.arm.ur_settings import UrArmSettings
 from actors.arm_geometry import ArmLimits, Box, JointAngles, Point, Pose, RobotCell

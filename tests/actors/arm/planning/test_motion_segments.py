@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from actors.arm.arm_interface import ArmRefusedError
 from actors.arm.planned_pour import JointPath
+from actors.arm.planning.motion_segments import jog_path, leans, rejoin, upright_way, way_home
 from actors.arm.ur.executed_motion import executed_path
-from actors.arm.ur.motion_segments import jog_path, leans, rejoin, upright_way, way_home
 from actors.arm.ur.primary_interface import PrimaryError, split
 from actors.arm.ur.urscript_writer import path_program, thinned
 from actors.arm.ur.worker_messages import MotionSettings

@@ -7,8 +7,8 @@ import math
 import pytest
 
 import decant
+from actors.arm.pour_feasibility import path_of
 from actors.arm.ur.robot_models import MODELS
-from actors.bench.pour_feasibility import path_of
 from actors.emulators.ur_controller.robot import calibrated
 from actors.interfaces import InvalidActionError
 

@@ -10,24 +10,17 @@ These functions are pure: nothing here moves an arm.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError
-from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath, PlaceWay, PourPath
-from actors.arm.planning.kinematics import (
-    cell_transforms,
-    flange_transforms,
-    forward,
-    inverse,
-    pourer_transforms,
-)
+from actors.arm.joint_arm import JointArmSettings, UnreachedError
+from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath, PlaceWay, PourPath, checked
+from actors.arm.planning.kinematics import cell_transforms, flange_transforms, pourer_transforms
 from actors.arm.planning.path_checks import outside
-from actors.arm.ur.urscript_writer import checked
-from actors.arm.ur.worker_messages import MotionOutcome
-from actors.arm.ur_settings import UrArmSettings
-from actors.arm_geometry import JOINT_NAMES, Joints
 
 OFF_PATH = 0.1
 """Joints farther than this from every point of a path are not on it [rad]; the arm was moved by other means."""
@@ -41,8 +34,8 @@ RAMP = 0.6
 _GRID = 0.02
 
 
-def leans(joints: FloatArray, spec: UrArmSettings) -> FloatArray:
-    """Tilt of the pourer for joints (T, 6) [rad], shape (T,) [rad]."""
+def leans(joints: FloatArray, spec: JointArmSettings) -> FloatArray:
+    """Tilt of the pourer for joints (T, n) [rad], shape (T,) [rad]."""
     tilts: FloatArray = np.arccos(np.clip(pourer_transforms(joints, spec).rotation[..., 2, 2], -1.0, 1.0))
     return tilts
 
@@ -52,7 +45,7 @@ def rejoin(path: JointPath, joints: FloatArray) -> tuple[float, float]:
 
     Args:
         path: any.
-        joints: (6,) [rad].
+        joints: (n,) [rad].
 
     Returns:
         Time of the nearest point of the path [s], and the largest distance of any joint from it [rad].
@@ -67,12 +60,12 @@ def rejoin(path: JointPath, joints: FloatArray) -> tuple[float, float]:
     return float(time), float(apart[nearest].max())
 
 
-def upright_way(path: PourPath, joints: FloatArray, spec: UrArmSettings) -> tuple[JointPath, FloatArray]:
+def upright_way(path: PourPath, joints: FloatArray, spec: JointArmSettings) -> tuple[JointPath, FloatArray]:
     """From a stopped pour to an upright pourer: back along the path, or forward if the pourer was already returning.
 
     Args:
         path: that was being executed.
-        joints: (6,) where the arm stands [rad].
+        joints: (n,) where the arm stands [rad].
         spec: its speeds.
 
     Returns:
@@ -96,12 +89,12 @@ def upright_way(path: PourPath, joints: FloatArray, spec: UrArmSettings) -> tupl
     return _paced(points, tilts, costs)
 
 
-def way_home(path: PourPath | PlaceWay, joints: FloatArray, spec: UrArmSettings) -> JointPath:
+def way_home(path: PourPath | PlaceWay, joints: FloatArray, spec: JointArmSettings) -> JointPath:
     """From any upright point of the approach or the retreat to home.
 
     Args:
         path: that was being executed.
-        joints: (6,) where the arm stands [rad].
+        joints: (n,) where the arm stands [rad].
         spec: its speeds.
 
     Raises:
@@ -144,13 +137,42 @@ def _paced(points: FloatArray, tilts: FloatArray, costs: FloatArray) -> tuple[Jo
     left = np.where(duration - times < ramp, (duration - times) ** 2 / (2.0 * ramp), duration - times - 0.5 * ramp)
     place = np.where(times < 0.5 * duration, done, duration - ramp - left) * length / max(duration - ramp, 1e-9)
     place = np.clip(place, 0.0, length)
-    joints = np.stack([np.interp(place, along, points[:, k]) for k in range(6)], axis=-1)
+    joints = np.stack([np.interp(place, along, column) for column in points.T], axis=-1)
     joints[0], joints[-1] = points[0], points[-1]
     return JointPath(times, joints), np.interp(place, along, tilts)
 
 
 def _astray(where: str, apart: float, remedy: str) -> str:
     return f"the arm does not stand on {where}: a joint is {np.degrees(apart):.1f}° away from it; {remedy}"
+
+
+class Ending(Protocol):
+    """How a motion ended; see `actors.arm.ur.worker_messages.MotionOutcome`."""
+
+    @property
+    def kind(self) -> str:
+        """'completed', or why it was interrupted, see `ArmStoppedError`."""
+        ...
+
+    @property
+    def text(self) -> str:
+        """The reason, as a message."""
+        ...
+
+    @property
+    def clock(self) -> float:
+        """Time on the path where it ended [s]."""
+        ...
+
+    @property
+    def joints(self) -> Sequence[float]:
+        """Where the arm stands [rad]; as last seen, if `standing` is None."""
+        ...
+
+    @property
+    def standing(self) -> float | None:
+        """When it was first seen at rest [s of `time.monotonic`]."""
+        ...
 
 
 UPRIGHT = 0.02
@@ -172,13 +194,13 @@ class MotionSegment:
     tilts: FloatArray
 
     @classmethod
-    def of(cls, name: str, path: JointPath, spec: UrArmSettings) -> MotionSegment:
+    def of(cls, name: str, path: JointPath, spec: JointArmSettings) -> MotionSegment:
         """A segment of one phase.
 
         Raises:
             ArmRefusedError: the path is invalid.
         """
-        path = checked(path)
+        path = checked(path, len(spec.home_joints))
         return cls(path, ((name, 0.0, path.duration),), leans(path.joints, spec))
 
     @classmethod
@@ -190,7 +212,7 @@ class MotionSegment:
         """
         if path.tilts.shape != path.pour.times.shape or not path.phases:
             raise ArmRefusedError("a pour's path has a tilt for each of its times, and phases")
-        return cls(checked(path.pour), path.phases, path.tilts)
+        return cls(checked(path.pour, path.approach.joints.shape[1]), path.phases, path.tilts)
 
     def slowed(self, factor: float) -> MotionSegment:
         """The same motion at a fraction of its speed."""
@@ -211,7 +233,7 @@ class MotionSegment:
         """Tilt of the pourer at a time [rad]."""
         return float(np.interp(time, self.path.times, self.tilts))
 
-    def tilt_left(self, outcome: MotionOutcome) -> float:
+    def tilt_left(self, outcome: Ending) -> float:
         """Tilt of the pourer after a stop [rad]; the arm still braked for a while after the path's clock stopped."""
         if outcome.standing is not None:
             time, apart = rejoin(self.path, np.array(outcome.joints))
@@ -219,7 +241,7 @@ class MotionSegment:
                 return self.tilt(time)
         return self.tilt(outcome.clock)
 
-    def stopped(self, outcome: MotionOutcome, executed: ExecutedPath) -> ArmStoppedError:
+    def stopped(self, outcome: Ending, executed: ExecutedPath) -> ArmStoppedError:
         """The error for an interrupted motion."""
         phase, tilt = self.phase(outcome.clock), self.tilt_left(outcome)
         tilted = f", the pourer tilted by {np.degrees(tilt):.0f}°" if tilt > UPRIGHT else ""
@@ -244,25 +266,25 @@ FASTEST_TURN, FASTEST_WAY = math.radians(20.0), 0.1
 """[rad/s], [m/s]."""
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
-_JOINT_AXES = tuple(f"joint {k}" for k in range(1, 7))
 _POINTS = 101
 
 
-def jog_path(spec: UrArmSettings, joints: Joints, axis: str, amount: float, speed: float) -> JointPath:
+def jog_path(spec: JointArmSettings, joints: Sequence[float], axis: str, amount: float, speed: float) -> JointPath:
     """One step from the arm's present pose.
 
     Args:
         spec: limits and tool.
         joints: present ones [rad].
-        axis: see `UrArm.jog`.
+        axis: see `actors.arm.arm_interface.Arm.jog`.
         amount: [rad] or [m].
         speed: [rad/s] or [m/s].
 
     Raises:
         ArmRefusedError: too far, too fast, out of reach, or outside the limits.
     """
-    if axis not in (*AXES, *_JOINT_AXES):
-        raise ArmRefusedError(f"no axis '{axis}'; there are {', '.join((*_JOINT_AXES, *AXES))}")
+    joint_axes = [f"joint {k}" for k in range(1, len(joints) + 1)]
+    if axis not in (*AXES, *joint_axes):
+        raise ArmRefusedError(f"no axis '{axis}'; there are {', '.join((*joint_axes, *AXES))}")
     straight = axis in ("x", "y", "z")
     farthest, fastest = (FARTHEST_WAY, FASTEST_WAY) if straight else (FARTHEST_TURN, FASTEST_TURN)
     if not 0.0 < abs(amount) <= farthest:
@@ -273,18 +295,18 @@ def jog_path(spec: UrArmSettings, joints: Joints, axis: str, amount: float, spee
     times = np.linspace(0.0, duration, _POINTS)
     share = 0.5 - 0.5 * np.cos(np.pi * times / duration)  # its highest speed is π/2 times the mean, and below the limit
     start = np.array(joints)
-    if axis in _JOINT_AXES:
+    if axis in joint_axes:
         points = np.repeat(start[None], _POINTS, axis=0)
-        points[:, _JOINT_AXES.index(axis)] += share * amount
+        points[:, joint_axes.index(axis)] += share * amount
     else:
         points = _tool_steps(spec, start, axis, share * amount)
     _check(spec, points)
     return JointPath(times, points)
 
 
-def _tool_steps(spec: UrArmSettings, start: FloatArray, axis: str, amounts: FloatArray) -> FloatArray:
-    model, tool = spec.robot, cell_transforms(spec).tool
-    rotation, position = forward(start[None], model)
+def _tool_steps(spec: JointArmSettings, start: FloatArray, axis: str, amounts: FloatArray) -> FloatArray:
+    model, tool = spec.kinematics, cell_transforms(spec).tool
+    rotation, position = model.forward(start[None])
     rotations, positions = np.repeat(rotation, _POINTS, axis=0), np.repeat(position, _POINTS, axis=0)
     along = np.eye(3)[AXES.index(axis) % 3]
     if axis in ("x", "y", "z"):
@@ -294,15 +316,10 @@ def _tool_steps(spec: UrArmSettings, start: FloatArray, axis: str, amounts: Floa
         turns = np.stack([_turn(along, angle) for angle in amounts])
         rotations = turns @ rotation
         positions = point - (rotations @ tool.position[None, :, None])[..., 0]
-    solutions = inverse(rotations, positions, model)
-    points = [start]
-    for candidates in solutions[1:]:
-        turned = candidates - 2.0 * np.pi * np.round((candidates - points[-1]) / (2.0 * np.pi))
-        apart = np.abs(turned - points[-1]).max(axis=-1)
-        if not np.isfinite(apart).any() or np.nanmin(apart) > 0.05:
-            raise ArmRefusedError("the arm can't make this step: out of its reach, or past a singularity")
-        points.append(turned[int(np.nanargmin(apart))])
-    return np.stack(points)
+    try:
+        return model.step(rotations, positions, start)
+    except UnreachedError:
+        raise ArmRefusedError("the arm can't make this step: out of its reach, or past a singularity") from None
 
 
 def _turn(axis: FloatArray, angle: float) -> FloatArray:
@@ -311,10 +328,10 @@ def _turn(axis: FloatArray, angle: float) -> FloatArray:
     return turned
 
 
-def _check(spec: UrArmSettings, points: FloatArray) -> None:
-    model = spec.robot
-    for name, positions, most in zip(JOINT_NAMES, points.T, model.joint_range, strict=True):
-        if np.abs(positions).max() > most:
+def _check(spec: JointArmSettings, points: FloatArray) -> None:
+    model = spec.kinematics
+    for name, positions, low, high in zip(model.joint_names, points.T, model.joint_low, model.joint_high, strict=True):
+        if positions.min() < low or positions.max() > high:
             raise ArmRefusedError(f"{name} would leave its range")
     flange = flange_transforms(points[[0, -1]], spec)
     frames = {"tool": cell_transforms(spec).tool.position, "pourer": cell_transforms(spec).pourer.position}
@@ -325,7 +342,7 @@ def _check(spec: UrArmSettings, points: FloatArray) -> None:
             raise ArmRefusedError(f"the {thing} would be {', '.join(outside(end, spec))}")
 
 
-def _beyond(point: FloatArray, spec: UrArmSettings) -> FloatArray:
+def _beyond(point: FloatArray, spec: JointArmSettings) -> FloatArray:
     """Distance of a point beyond each limit [m], negative inside."""
     limits = spec.limits
     planes = [plane.offset - float(np.dot(plane.normal, point)) for plane in limits.planes]

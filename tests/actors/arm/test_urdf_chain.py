@@ -1,0 +1,134 @@
+"""`urdf_chain`: any arm from its URDF, compared with a UR's closed forms; and what is no arm is refused."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pinocchio")
+
+from actors.arm.joint_arm import UnreachedError
+from actors.arm.planned_pour import JointPath
+from actors.arm.planning.kinematics import flange_poses
+from actors.arm.planning.path_checks import check_limits
+from actors.arm.ur.robot_models import MODELS, TWISTS, RobotModel
+from actors.arm.ur.ur_kinematics import kinematics_of
+from actors.arm.urdf_chain import ChainError, ChainModel
+from actors.arm_geometry import Point
+from actors.interfaces import InvalidActionError
+from decant.plugins import plan_pour
+from tests.plugins.decant_example.seven_joints import SevenJointKind
+from tests.plugins.test_seven_joints import CELL, SETTINGS
+from tests.plugins.test_stand import ACTION, SCENE
+
+_LIMIT = '<limit lower="-6.3" upper="6.3" velocity="3.1" effort="1"/>'
+
+
+def urdf_of(robot: RobotModel) -> str:
+    """The URDF of a robot from its Denavit–Hartenberg parameters: a joint, then a fixed link's length and twist."""
+    links = ['<link name="base"/>']
+    frame, before = "base", ""
+    for k in range(6):
+        links += [
+            f'<link name="link{k}"/>',
+            f'<joint name="joint{k}" type="revolute"><parent link="{frame}"/><child link="link{k}"/>'
+            f'{before}<axis xyz="0 0 1"/>{_LIMIT}</joint>',
+        ]
+        frame, before = f"link{k}", f'<origin xyz="{robot.a[k]} 0 {robot.d[k]}" rpy="{TWISTS[k]} 0 0"/>'
+    links.append(f'<link name="flange"/><joint name="end" type="fixed"><parent link="{frame}"/><child link="flange"/>')
+    return f'<robot name="ur">{"".join(links)}{before}</joint></robot>'
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "arm.urdf"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("name", ["ur3e", "ur10", "ur10e"])
+def test_a_ur_from_its_urdf_is_the_ur_in_closed_form(name: str, tmp_path: Path) -> None:
+    chain = ChainModel(written(tmp_path, urdf_of(MODELS[name])), "base", "flange")
+    closed = kinematics_of(MODELS[name])
+    joints = np.random.default_rng(1).uniform(-3.0, 3.0, (200, 6))
+    for mine, theirs in zip(chain.forward(joints), closed.forward(joints), strict=True):
+        assert np.abs(mine - theirs).max() < 1e-5 / 2.0, "0.01 mm"
+    home = np.radians([-14.0, -91.0, -115.0, -154.0, -104.0, 0.0])
+    way = home + np.linspace(0.0, 1.0, 60)[:, None] * np.radians([20.0, -10.0, 15.0, 0.0, 5.0, 80.0])
+    assert chain.follow(*closed.forward(way), way[0], home) == pytest.approx(way, abs=1e-6)
+
+
+def test_joints_are_a_function_of_the_pose_and_keep_their_posture() -> None:
+    path = SevenJointKind(SETTINGS).plan(SCENE, ACTION)
+    steps = np.abs(np.diff(path.pour.joints, axis=0)).max()
+    assert steps < math.radians(3.0), "the elbow flips"
+    assert path.pour.joints[-1] == pytest.approx(path.pour.joints[0], abs=1e-5), "the pour ends where it began"
+    wanted = plan_pour(SCENE, ACTION).sample(path.pour.times)
+    poses = SevenJointKind(SETTINGS).figure().pourer(path.pour.joints)
+    assert poses[:, :3] == pytest.approx(wanted[:, :3], abs=1e-6)
+    assert np.abs(np.sum(poses[:, 3:] * wanted[:, 3:], axis=1)).min() == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_change_of_posture_on_the_way_is_refused() -> None:
+    """The same poses, begun on the other side of the elbow, are no way from this home."""
+    chain, home = SETTINGS.kinematics, np.array(SETTINGS.home)
+    rotation, position = chain.forward(np.array([home, home + 1.2 * np.eye(7)[3], home]))
+    with pytest.raises(UnreachedError):
+        chain.follow(rotation, position, home, home)
+
+
+def test_a_pour_beyond_its_reach_is_refused_with_the_distance_and_the_remedy() -> None:
+    far = SETTINGS.with_values(cell=CELL.with_values(receiver=Point.of(0.97, 0.0, 0.15)))
+    with pytest.raises(InvalidActionError, match=r"the arm 0\.08 from a singular pose, 0\.10 are asked for; move the"):
+        SevenJointKind(far).plan(SCENE, ACTION)
+    chain = SETTINGS.kinematics
+    flange = flange_poses(np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], [0.6, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]), far)
+    index, text = chain.out_of_reach(flange.rotation, flange.position, np.array(SETTINGS.home))
+    assert (index, text.partition(" by ")[0]) == (1, "out of the arm's reach")
+    farther = SETTINGS.with_values(cell=CELL.with_values(receiver=Point.of(2.0, 0.0, 0.15)))
+    assert any("out of reach by" in text for text in check_limits(farther))
+
+
+def test_a_link_that_meets_the_receiver_is_refused() -> None:
+    """The collision geometry of the URDF counts: held behind the flange, the pourer brings the last link down."""
+    behind = SETTINGS.with_values(grip=SETTINGS.grip.with_values(z=-0.2))
+    with pytest.raises(InvalidActionError, match=r"the link7 would come within -\d mm of the receiver"):
+        SevenJointKind(behind).plan(SCENE, ACTION)
+
+
+ARM = urdf_of(MODELS["ur10e"])
+
+
+@pytest.mark.parametrize(
+    ("text", "flange", "message"),
+    [
+        (ARM, "tool0", r"has no link 'tool0'; there are base, link0, .*flange"),
+        (ARM, "base", r"no joint moves link 'base' against link 'base'"),
+        (ARM.replace(_LIMIT, "", 1).replace("revolute", "continuous", 1), "flange", r"'joint0' turns without limits"),
+        (ARM.replace("revolute", "prismatic", 1), "flange", r"'joint0' is a PZ; a revolute joint with limits"),
+        (ARM.replace('upper="6.3"', 'upper="-6.3"', 1), "flange", r"'joint0' has no limits; add <limit"),
+        (ARM[:300], "flange", r"can't be read as a URDF"),
+        (
+            ARM.replace('<link name="link2"/>', '<link name="link2"><collision><geometry><mesh filename="no.stl"/>'
+                        "</geometry></collision></link>"),
+            "flange",
+            r"collision geometry can't be read: .*no.stl",
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_no_arm_is_refused_with_the_reason(text: str, flange: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ChainError, match=message):
+        ChainModel(written(tmp_path, text), "base", flange)
+
+
+def test_links_lie_within_their_capsules() -> None:
+    chain = SETTINGS.kinematics
+    assert [link.name for link in chain.bars] == ["link1", "link3", "link5", "link7", "gripper"]
+    joints = np.random.default_rng(2).uniform(-1.5, 1.5, (20, 7))
+    points = chain.points(joints)
+    first, second = (points[:, [getattr(link, end) for link in chain.bars[:4]]] for end in ("first", "second"))
+    lengths = np.linalg.norm(first - second, axis=-1)
+    assert lengths == pytest.approx(np.tile([0.2, 0.27, 0.29, 0.026], (20, 1)), abs=1e-9)
+    assert isinstance(JointPath(np.array([0.0, 1.0]), joints[:2]).duration, float)
