@@ -11,10 +11,21 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+from actors.balance.balance_interface import unsettled
 from actors.balance.dialect_registry import dialects
 from actors.balance.dialects.dialect import Dialect
 from actors.balance.line_recording import Capture
-from actors.balance.readings import IN_TURN, LineError, OtherQuantityError, Reading, ReadingStatus, WeightMark, in_turn
+from actors.balance.readings import (
+    IN_TURN,
+    Acknowledgement,
+    LineError,
+    OtherQuantityError,
+    Reading,
+    ReadingReply,
+    ReadingStatus,
+    WeightMark,
+    in_turn,
+)
 
 _LONGEST = 60
 _MOST = 4
@@ -98,6 +109,29 @@ def _framed(line: bytes) -> str | None:
         "Its lines stand between STX and ETX (\\x02, \\x03), as in no protocol here: switch these off in the balance's "
         "menu, or choose a plain text print-out"
     )
+
+
+def _status_alone(lines: Sequence[bytes]) -> str:
+    """What lines that state no weight but a status, all of them, mean, and the remedy; '' for other lines."""
+    for dialect in dialects().values():
+        match replies := [_decoded(dialect, line) for line in lines]:
+            case [Acknowledgement(answer=ReadingReply.REFUSED), *_] if len({*map(type, replies)}) == 1:
+                return (
+                    "They are error replies: the balance does not know, or can't carry out, the commands that it was "
+                    "sent. Select the protocol of these commands in its menu, or send those of its own protocol"
+                )
+            case [Reading(status=ReadingStatus.BUSY), *_] if _without_value(replies):
+                return "It was busy or not at rest each time: record again when its display stands still"
+            case [Reading(status=ReadingStatus.OVER | ReadingStatus.UNDER | ReadingStatus.ERROR) as first, *_] if (
+                _without_value(replies)
+            ):
+                text = unsettled(first, "", 0.0, 0)[1]
+                return f"{text[0].upper()}{text[1:]}"
+    return ""
+
+
+def _without_value(replies: Iterable[object]) -> bool:
+    return all(isinstance(reply, Reading) and reply.value is None for reply in replies)
 
 
 def _parity(lines: Sequence[bytes]) -> str | None:
@@ -197,6 +231,8 @@ def explain_capture(capture: Capture) -> tuple[list[str], str | None]:
         labels = {match.lastindex for match in map(_LABEL.match, lines) if match}
         if framed is not None:
             problem += framed
+        elif status := _status_alone(lines):
+            problem += status
         elif not is_text(b"".join(lines)):
             problem += (
                 "They are not text: speed or parity differ; set 'baud' and 'format' as in the balance's menu, over "

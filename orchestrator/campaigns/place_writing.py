@@ -105,14 +105,14 @@ def labware_rack(path: Path) -> tuple[RackSettings, float]:
     """
     try:
         labware = json.loads(path.read_text(encoding="utf-8"))
+        if not {"wells", "metadata", "ordering"} - {*labware} and "schemaVersion" not in labware:
+            raise DecantError(f"{path}: is a labware definition of schema 1; 2 and 3 can be read")
         schema, wells, meta = labware["schemaVersion"], labware["wells"], labware["metadata"]
         category, name = str(meta["displayCategory"]), str(meta["displayName"])
         cells = {key: tuple(float(well[axis]) for axis in ("x", "y", "z", "depth")) for key, well in wells.items()}
         tips = bool(labware.get("parameters", {}).get("isTiprack"))
         if not all(map(math.isfinite, chain.from_iterable(cells.values()))):
             raise ValueError("a length is no number")
-        if not all(depth > 0.0 for *_, depth in cells.values()):
-            raise ValueError("a depth is not more than 0")
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise DecantError(
             f"{path}: should be a labware definition of Opentrons with 'schemaVersion', 'metadata' and 'wells', each "
@@ -120,10 +120,17 @@ def labware_rack(path: Path) -> tuple[RackSettings, float]:
         ) from None
     if schema not in (2, 3):
         raise DecantError(f"{path}: has schemaVersion {schema!r}; 2 and 3 can be read")
+    if not cells:
+        raise DecantError(f"{path}: '{name}' has no wells, so that nothing stands in it; a rack has some")
     if category not in RACKS or tips:
         raise DecantError(
-            f"{path}: '{name}' is a {category}: its wells are part of it, and no gripper can grip them or take them "
-            f"out; a rack has the displayCategory {' or '.join(RACKS[:2])}"
+            f"{path}: '{name}' has the displayCategory {category}: its wells are part of it, and no gripper can grip "
+            f"them or take them out; a rack has the displayCategory {' or '.join(RACKS[:2])}"
+        )
+    if flat := [key for key, (*_, depth) in cells.items() if depth <= 0.0]:
+        raise DecantError(
+            f"{path}: the depth of {flat[0]} of '{name}' is not more than 0, as that of a mark to calibrate with: no "
+            "vessel stands in it"
         )
     positions = {key: re.fullmatch(r"([A-Z])([1-9]\d?)", key) for key in cells}
     if "A1" not in cells or None in positions.values():

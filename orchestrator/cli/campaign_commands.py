@@ -231,6 +231,7 @@ def plan(
                 "receiver": receiver_name,
                 "action": recommended.action,
                 "action_si": recommended.action_si,
+                "equal_ranges": recommended.equal_ranges,
                 "predicted_loss": recommended.predicted_loss,
                 "predicted_spillage": None if spillage is None else spillage.mean,
                 "predicted_spillage_deviation": None if spillage is None else spillage.deviation,

@@ -35,6 +35,9 @@ class _PlannedParts(CommandOutput):
     """The recommended action, in deg, deg/s, mm and s."""
 
     action_si: dict[str, float | None]
+    equal_ranges: dict[str, tuple[float, float]] | None
+    """Ends of the ranges in which the expected loss is as small [SI], one dimension changed at a time."""
+
     predicted_loss: float | None
     predicted_deviation: float | None
     predicted_spillage: float | None

@@ -18,6 +18,8 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from orchestrator.recordings.recording_file import PourRecording
 from orchestrator.recordings.recording_fit import UNKNOWNS, Fit, fit_recordings
 from orchestrator.recordings.recording_replay import PourReplay
@@ -85,6 +87,12 @@ def replay_doubts(replay: PourReplay) -> list[str]:
 
 def likely_cause(recordings: Sequence[PourRecording], unknowns: Sequence[str] = ("grip", "lag")) -> str:
     """The other meaning of the columns with which the readings agree best, and what to do; '' if there is none."""
+    if still := [recording for recording in recordings if not np.ptp(recording.readings)]:
+        readings = still[0].readings
+        return (
+            f"all {len(readings)} readings of {still[0].name} are {1e3 * readings[0]:.6g} g: the balance or its "
+            "recording stood still, or nothing reached the receiver; record the pour again"
+        )
     explanations = []
     for order, (cause, change) in enumerate(_other_meanings(recordings)):
         changed = [change(recording) for recording in recordings]

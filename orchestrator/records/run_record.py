@@ -411,7 +411,10 @@ class RunState:
                 stage.occupancy.pour_finished(event.time)
                 stage.pours += 1
                 self.checkpoint = ""
-                self._pour(event).finish(event)
+                pour = self._pour(event)
+                pour.finish(event)
+                if pour.refused:
+                    self.pour = pour  # it may never have started
             case RequestFinished(request=Ask(text) as request, outcome=Answered(answer)):
                 question = self._question(event, text)
                 question.answer, question.proposes = answer, request.proposals is not None

@@ -377,7 +377,7 @@ class RequestExecutor:
         withdrawn: Callable[[str], None] = lambda reason: None,
         progress: ProgressCallback,
     ) -> Outcome:
-        """Pour once.
+        """Pour once. A pour that the arm can't make does not start.
 
         Args:
             started: called immediately before the arm starts; must have written a durable record of it when it returns.
@@ -392,6 +392,8 @@ class RequestExecutor:
             BenchLostError: the bench was lost before the pour.
         """
         bench, scene = self.bench, self._scene(request.scene)
+        if self._arm is not None and (reason := await asyncio.to_thread(_refusal, scene, request.action, self._arm)):
+            return Failed("invalid_action", reason)
         async with self._real:
             started()
             try:

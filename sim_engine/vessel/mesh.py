@@ -7,6 +7,7 @@ solid, cavity, brim, opening and lip, and keeps them in the cache by content.
 from __future__ import annotations
 
 import io
+import math
 import re
 from pathlib import Path
 from typing import Any, Protocol
@@ -68,6 +69,38 @@ def check_size(path: Path) -> None:
         )
 
 
+_OTHER_FORMATS = (
+    (re.compile(rb"ISO-10303"), "a STEP file, a CAD model without triangles: export it as STL"),
+    (re.compile(rb"(?i)<!doctype html|<html"), "a web page: download the mesh itself, on GitHub with 'Raw'"),
+    (re.compile(rb"glTF"), "a GLB file: name it .glb"),
+    (re.compile(rb"ply\r?\n"), "a PLY file: name it .ply"),
+    (re.compile(rb"PK\x03\x04(?=.{0,200}3D/3dmodel)", re.DOTALL), "a 3MF file: name it .3mf"),
+    (re.compile(rb"PK\x03\x04"), "an archive (ZIP): unpack it"),
+)
+"""Begin of files that are sent under the name of another format, and what to do."""
+
+_FORMAT_BEGINS = {"glb": b"glTF", "ply": b"ply", "3mf": b"PK"}
+
+
+def _check_format(name: str, kind: str, content: bytes) -> None:
+    begin = content[:1000].lstrip(b"\xef\xbb\xbf \t\r\n")
+    if begin.startswith(_FORMAT_BEGINS.get(kind, b"\0")):
+        return
+    for pattern, remedy in _OTHER_FORMATS:
+        if pattern.match(begin):
+            raise VesselError(f"{name}: is {remedy}")
+
+
+def _check_finite(name: str, content: bytes) -> None:
+    """Refuse an OBJ file with a vertex that is no number, of which trimesh reads no triangles."""
+    for number, line in enumerate(content.splitlines(), start=1):
+        if re.match(rb"(?i)\s*v\s.*(?:nan|inf)", line):
+            raise VesselError(
+                f"{name}:{number}: a vertex is not a finite number ({line.decode('ascii', 'replace').strip()[:60]}); "
+                "export the mesh again, or remove this vertex and its faces"
+            )
+
+
 def load_triangles(path: Path) -> Any:
     """All triangles of a file as one `trimesh.Trimesh`, in the unit and the axes of the file.
 
@@ -87,7 +120,9 @@ def load_triangles(path: Path) -> Any:
             f"{path.name}: is a pointer of Git LFS, a text of {len(content)} bytes that stands for the mesh; fetch the "
             "mesh itself with 'git lfs pull'"
         )
+    _check_format(path.name, kind, content)
     if kind == "obj":
+        _check_finite(path.name, content)
         content = _with_absolute_indices(content)
     elif kind == "stl" and b"\0" in content[80:84]:  # binary; text has no byte 0
         end = 84 + 50 * int.from_bytes(content[80:84], "little")
@@ -322,7 +357,7 @@ def _measure(spec: VesselSpec, shape: MeshFile) -> Vessel:
     fill = flood(~inside)
     if refusal is not None:
         _check_walls(fill, layout, exact_cavity(vertices, faces), refusal)
-    _check_cavity(fill, shape, layout.spacing, vertices, layout.origin[2])
+    _check_cavity(fill, ~inside, shape, layout.spacing, vertices, layout.origin[2])
     rim = brim_height(fill, ~inside, layout, hits)
     floor = floor_height(fill, layout, hits)
     values = signed_distance(vertices, faces, layout, inside)
@@ -489,7 +524,26 @@ def _doubts(
     return tuple(doubts)
 
 
-def _check_cavity(fill: CavityFill, shape: MeshFile, spacing: float, vertices: Floats, bottom: float) -> None:
+def _other_up(free: NDArray[np.bool_], shape: MeshFile, least: int) -> tuple[str, int]:
+    """The axis of the file with which up the mesh holds most, and number of cells that it holds; '' for none.
+
+    Args:
+        free: cells of the grid that are not solid, the axis that counts as up last.
+        least: number of cells that count as a cavity.
+    """
+    held: dict[str, int] = {}
+    for name in ("x", "y", "z", "-x", "-y", "-z"):
+        direction = to_z(shape.up) @ to_z(name)[2]  # of the file's axis in the grid
+        axis = int(np.argmax(np.abs(direction)))
+        turned = np.moveaxis(free, axis, 2)
+        held[name] = int(np.count_nonzero(flood(turned if direction[axis] > 0.0 else turned[:, :, ::-1]).pool))
+    best = max(held, key=lambda name: held[name])
+    return (best, held[best]) if held[best] >= least else ("", 0)
+
+
+def _check_cavity(
+    fill: CavityFill, free: NDArray[np.bool_], shape: MeshFile, spacing: float, vertices: Floats, bottom: float
+) -> None:
     """Refuse a shape that holds no liquid, with the most likely reason."""
     box = float(np.prod(np.ptp(vertices, axis=0)))
     least = SMALLEST_SHARE * box
@@ -502,6 +556,12 @@ def _check_cavity(fill: CavityFill, shape: MeshFile, spacing: float, vertices: F
         raise VesselError(
             f"{name}: no opening: a cavity of {1e6 * fill.enclosed * cell:.3g} mL is closed on all sides; "
             "cut the lid away"
+        )
+    up, cells = _other_up(free, shape, math.ceil(least / cell))
+    if up:
+        raise VesselError(
+            f"{name}: holds nothing if '{shape.up}' is up; if '{up}' is, it holds {1e6 * cells * cell:.3g} mL. State "
+            f"'up: {up}', or with 'decant vessel mesh' --up {up}"
         )
     if fill.drained * cell >= least:
         at = max(bottom + spacing * (fill.drain - 1), 0.0)  # the hole begins between two slices

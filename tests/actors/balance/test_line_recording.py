@@ -337,6 +337,13 @@ def test_the_files_of_other_programs_are_explained(tmp_path, content, note):
         ),
         (b"S S 12 PCS\r\n", "no dialect reads a weight"),
         (b"S D 12:07.50 lb:oz\r\n", "no dialect reads a weight"),  # artisan-roaster-scope/artisan, pull request 2223
+        # replies alone, of balances that were sent commands of another protocol, or could not weigh
+        (b"ES\r\n" * 5, "They are error replies: the balance does not know, or can't carry out, the commands"),
+        (b"EC,E01\r\n" * 3, "Select the protocol of these commands in its menu"),
+        (b"S I\r\n" * 4, "It was busy or not at rest each time: record again when its display stands still"),
+        (b"S +\r\n" * 4, "Over range: more is on it than it weighs"),
+        (b"Err 54\r\n" * 3, "It reports a fault"),
+        (b"+ ~~~~~~~~GN\r\n" * 3, "no dialect reads a weight"),  # eamars/OpenTrickler-RP2040-Controller, 49: overload
         (b"dear colleague,\nthe balance does not work\n", "no dialect reads a weight"),
     ],
 )

@@ -106,6 +106,11 @@ def test_a_recording_keeps_the_times_of_tilt_and_mass(tmp_path: Path) -> None:
         (
             "",
             changed(12, "1.0,30,1800"),
+            "pour.csv:12:8: mass: this reading is 1800 g, and those next to it are 180 and 180 g: it was damaged",
+        ),
+        (
+            "",
+            [*ROWS[:10], *(f"{k / 10},30,1800" for k in range(10, 20))],
             "pour.csv:12:8: mass: the readings have risen by 1620 g, and the pourer held 300",
         ),
         ("", ["0,0,", "1,30,", "2,,180"], "has fewer than two readings of the mass"),

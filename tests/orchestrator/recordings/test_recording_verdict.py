@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -93,3 +94,11 @@ def test_ounces_are_refused_by_the_command_and_no_value_is_written(tmp_path: Pat
 def test_small_values_of_a_good_rig_raise_no_doubt() -> None:
     recording = with_tilt(1.0)(dose(2))
     assert not fit_doubts(fit_recordings([recording], ("grip",)), [recording])
+
+
+def test_a_mass_that_never_changes_is_no_wrist_that_is_turned() -> None:
+    recording = dose(1)
+    still = replace(recording, readings=np.full_like(recording.readings, recording.readings[0]))
+    sentence = unlikely([still], fit_recordings([still], ("grip",)))
+    assert "the balance or its recording stood still, or nothing reached the receiver" in sentence
+    assert "wrist" not in sentence

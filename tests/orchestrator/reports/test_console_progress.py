@@ -232,6 +232,20 @@ def test_a_refused_pour_keeps_its_number_and_the_next_one_says_how_many_were_beg
             assert (tally.pour_line() or "").startswith(lines[event.request.number])
 
 
+def test_a_pour_that_is_refused_before_it_starts_does_not_repeat_the_line_of_the_one_before() -> None:
+    plan = campaign()
+    tally, pours = ProgressState(plan), [e for e in events(plan) if isinstance(getattr(e, "request", None), Pour)]
+    for event in pours:
+        second = event.request.number == 2
+        if isinstance(event, RequestFinished) and second:
+            tally(replace(event, outcome=Failed("invalid_action", "joint 6 would turn at 150 deg/s")))
+            line = tally.pour_line() or ""
+            assert line.startswith("pour 2")
+            assert "joint 6 would turn at 150 deg/s" in line
+        elif not second:
+            tally(event)
+
+
 def test_display_can_be_left_after_a_failure_and_says_how_the_run_ended() -> None:
     plan, terminal = campaign(), console(terminal=True)
     display = ProgressDisplay(plan, console=terminal)

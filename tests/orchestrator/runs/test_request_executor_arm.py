@@ -1,4 +1,4 @@
-"""A simulation of an action that the laboratory's arm can't make is an invalid action: no plan recommends it."""
+"""An action that the laboratory's arm can't make is an invalid action, simulated or poured: no plan recommends it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import decant
-from orchestrator.learning.requests import Failed, Simulate, Simulated
+from orchestrator.learning.requests import Failed, Pour, Simulate, Simulated
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor
 from sim_engine.outcome import SimulatedPour
 from sim_engine.scene import PoseError, PourTask
@@ -54,3 +54,20 @@ def test_an_action_beyond_the_arm_is_refused_in_simulation_too(
     if isinstance(answer, Failed):
         assert answer.kind == "invalid_action"
         assert "joint 6 (wrist 3) would turn at 151 deg/s" in answer.reason
+
+
+def test_a_proposed_pour_that_the_arm_cannot_make_never_starts() -> None:
+    """D2 proposes pours without simulating them."""
+    plan = decant.load_campaign(decant.shipped("campaigns/quickstart.yaml"))
+    (scene,) = plan.deployment.scenes  # type: ignore[union-attr]
+    laboratory: Any = SimpleNamespace(simulators=Pool(), bench=None)
+    laboratory.bench = SimpleNamespace(pour=lambda *_, **__: pytest.fail("the bench is asked to pour"))
+    executor = RequestExecutor(laboratory, {scene.name: scene}, Deadlines(), 0.0, arm=plan.laboratory.arm)
+    action = scene.action({"angular_velocity": math.radians(151.0), "x_offset": 0.1})
+    started = lambda: pytest.fail("a refused pour is recorded as begun")  # noqa: E731
+    outcome = asyncio.run(
+        executor.pour(Pour(scene.name, action, 1, 0), started=started, progress=lambda _: None)  # type: ignore[arg-type]
+    )
+    assert isinstance(outcome, Failed)
+    assert outcome.kind == "invalid_action"
+    assert "joint 6 (wrist 3) would turn at 151 deg/s" in outcome.reason

@@ -226,7 +226,7 @@ def test_cup_with_a_notch_in_its_rim_holds_only_up_to_the_notch(build: Make) -> 
     [
         (trimesh.creation.cylinder(radius=30, height=80), "no cavity: the mesh is one closed skin"),
         (cup(hole=6.0), "runs out 0 mm above the underside; close the hole"),
-        (cup().apply_transform(np.diag([1.0, -1.0, -1.0, 1.0])), "state which axis is up"),
+        (cup().apply_transform(np.diag([1.0, -1.0, -1.0, 1.0])), "if '-z' is, it holds 16[0-9] mL. State 'up: -z'"),
     ],
     ids=["scanned skin", "hole in the floor", "upside down"],
 )
@@ -271,6 +271,16 @@ def test_metres_need_no_unit(build: Make) -> None:
     ("name", "content", "message"),
     [
         ("cup.step", b"ISO-10303-21;", "use stl, obj, ply, glb"),
+        ("cup.stl", b"ISO-10303-21;\nHEADER;\n", "is a STEP file, a CAD model without triangles: export it as STL"),
+        ("cup.stl", b"\n<!DOCTYPE html>\n<html>", "is a web page: download the mesh itself, on GitHub with 'Raw'"),
+        ("cup.stl", b"glTF\2\0\0\0", "is a GLB file: name it .glb"),
+        ("cup.stl", b"PK\3\4" + bytes(26) + b"cup.step", r"is an archive \(ZIP\): unpack it"),
+        # RuoyuChen10/Deep3DFaceReconstruction, issue 1, and microsoft/Deep3DFaceReconstruction, issue 152
+        (
+            "cup.obj",
+            b"v 0 0 0\nv nan nan nan nan nan nan\nv 0 1 0\nf 1 2 3\n",
+            r"cup.obj:2: a vertex is not a finite number \(v nan nan nan nan nan nan\); export",
+        ),
         ("cup.glb", b"glTF but not really", "not a readable GLB file"),
         ("cup.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles|not a readable"),
         (
@@ -286,6 +296,13 @@ def test_file_that_is_no_mesh_is_refused(tmp_path: Path, name: str, content: byt
     path.write_bytes(content)
     with pytest.raises(VesselError, match=message):
         build_vessel(VesselSpec(name="broken", shape=MeshShape(path=path)))
+
+
+@pytest.mark.parametrize(("suffix", "up", "true"), [("glb", "y", "z"), ("stl", "x", "z"), ("stl", "-z", "z")])
+def test_a_wrong_axis_is_named_with_the_right_one(build: Make, suffix: str, up: str, true: str) -> None:
+    """mikedh/trimesh, issue 1759: GLB files of one model with different axes up."""
+    with pytest.raises(VesselError, match=f"holds nothing if '{up}' is up; if '{true}' is, it holds 16[0-9] mL"):
+        build(cup(), suffix=suffix, up=up)
 
 
 def test_a_home_that_can_not_be_written_costs_the_cache_and_no_run(
