@@ -75,12 +75,13 @@ def arm() -> Iterator[VelocityArm]:
 @pytest.mark.parametrize("speed", [20.0, 60.0, 120.0])
 def test_the_executed_tilt_is_the_planned_one(speed: float, arm: VelocityArm) -> None:
     path = KIND.plan(SCENE, replace(ACTION, angular_velocity=speed * DEG, return_velocity=speed * DEG))
+    arm.robot.cable.stretch = 0.01  # type: ignore[attr-defined]  # as often as a driver reads on an idle machine
     arm.release()
     arm.move_to_start(path)
     executed = arm.execute(path)
-    lags = np.linspace(0.0, 0.02, 21)
+    lags = np.linspace(-0.02, 0.02, 41)
     errors = [np.abs(path.pour.at(executed.times - lag) - executed.joints).max() for lag in lags]
-    assert min(errors) < 0.3 * DEG
+    assert min(errors) < (0.3 + 2e-3 * speed) * DEG  # a command holds for 10 ms, so that ramps are up to 2 ms off
 
 
 def test_an_arm_that_was_moved_by_other_means_is_not_moved_blindly(arm: VelocityArm, path) -> None:
