@@ -207,7 +207,8 @@ def compare(told: Told) -> list[str]:
     verdict, events = told.verdicts["journal"], told.events
     wrong = [f"{place}: {found}" for place, found in told.verdicts.items() if found != verdict]
     for place, said in told.words.items():
-        if verdict["word" if place == "metric" else "text"] not in said:
+        wanted = verdict["word"] if place == "metric" else verdict["text"][1:]  # the report begins with a capital
+        if wanted not in said:
             wrong.append(f"{place}: {said}")
     if (told.state, told.exit_code, verdict["word"]) != ("finished", 4, "incomplete"):
         wrong.append(f"{told.state}, exit code {told.exit_code}, {verdict['word']}")

@@ -19,6 +19,7 @@ from orchestrator.runs.run_engine import run_campaign
 from tests.reliability.afterwards import record
 from tests.reliability.mixture_night import KINDS, MixtureNight, night_plan
 from tests.reliability.night import FAULTS, ROOT, Night, chosen
+from tests.reliability.night_verdict import compare, night
 from tests.reliability.program import Optimizer
 from tests.support.toy_campaign import ToyLaboratory
 
@@ -50,6 +51,15 @@ def test_a_fault_in_a_night_of_mixtures_ends_safe_with_one_message_and_every_cup
     assert night.runs == 2
     assert [cup.state for cup in result.cups] == ["full", "full"]
     assert all(abs(share - true) <= 2.0 * half for share, half, true in night.shares(result))
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+def test_every_place_tells_the_same_verdict_of_a_night_in_which_doses_are_missed_refused_and_unknown(
+    tmp_path: Path,
+) -> None:
+    """Five cups; `night_verdict` plays 24 of them."""
+    assert compare(asyncio.run(night(tmp_path, 5, ("water", "oil")))) == []
 
 
 @pytest.mark.slow
