@@ -83,8 +83,14 @@ GROUPS = {
 
 def spouted_vessel(cup: TrueCup) -> Vessel:
     """Return the vessel model of the controllers: a mesh with the spout's outline, not the bench's model."""
+    with tempfile.TemporaryDirectory() as folder:
+        return build_vessel(cup_spec(cup, Path(folder)), use_cache=False)
+
+
+def cup_spec(cup: TrueCup, folder: Path) -> VesselSpec:
+    """Return the vessel of a cup; the mesh of a spouted one is written into a folder."""
     if cup.spout_length == 0.0:
-        return build_vessel(cylinder("beaker", inner_radius=cup.radius, inner_height=cup.height))
+        return cylinder("beaker", inner_radius=cup.radius, inner_height=cup.height)
     import trimesh
 
     wall, top = 0.003, cup.height + 0.003
@@ -95,10 +101,9 @@ def spouted_vessel(cup: TrueCup) -> Vessel:
     rise = np.clip((z / top - 0.75) / 0.25, 0.0, 1.0) ** 2
     spread = np.exp(-((np.arctan2(y, x) / (0.5 * cup.spout_width / cup.radius)) ** 2))
     out = 1.0 + cup.spout_length * rise * spread / np.maximum(np.hypot(x, y), 1e-6) * (np.hypot(x, y) > 0.01)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "spouted.stl"
-        trimesh.Trimesh(np.column_stack([x * out, y * out, z]), faces).export(path)
-        return build_vessel(VesselSpec(name="spouted", shape=MeshShape(path=path, unit="m")), use_cache=False)
+    path = folder / f"spouted-{1e3 * cup.radius:g}.stl"
+    trimesh.Trimesh(np.column_stack([x * out, y * out, z]), faces).export(path)
+    return VesselSpec(name="spouted", shape=MeshShape(path=path, unit="m"))
 
 
 @dataclass(frozen=True)

@@ -615,30 +615,31 @@ def dosing_faults() -> str:
 
 
 def dosing_particles() -> str:
-    """Doses of the virtual bench against a particle simulation of the same tilt."""
-    data = json.loads((FOLDER / "data" / "dosing.json").read_text(encoding="utf-8"))["particle_simulation"]
-    head = (
-        "wanted",
-        "doses",
-        "difference g",
-        "smallest … largest g",
-        "as a shift of the onset",
-    )
-    rows = [
-        tuple(
-            text.replace("-", "−")
-            for text in (
-                name,
-                str(row["doses"]),
-                f"{row['difference']:+.1f} ± {row['deviation']:.1f}",
-                f"{row['smallest']:+.1f} … {row['largest']:+.1f}",
-                f"{row['onset']:+.2f}° ± {row['onset_deviation']:.2f}°",
-            )
-        )
-        for name, row in data["rows"].items()
+    """Doses of particles in closed loop."""
+    rows = json.loads((FOLDER / "data" / "dosing-particles.json").read_text(encoding="utf-8"))["rows"]
+    head = [
+        *("source", "doses", "mean error g", "bias g", "95 % g", "worst g", "over +1 g", "unnoticed", "spilled g"),
+        *("covers", "time s"),
     ]
-    how = f"{data['particles']} particles, seeds from {data['first']}; {data['machine']['date']}"
-    return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing_particles.py --json`; {how}.</sub>\n"
+    lines = [
+        [
+            name,
+            str(row["doses"]),
+            f"{row['mean']:.2f}",
+            f"{row['bias']:+.2f}".replace("-", "−"),
+            f"{row['p95']:.2f}",
+            f"{row['worst']:+.2f}".replace("-", "−"),
+            str(row["over"]),
+            str(row["unnoticed"]),
+            f"{row['spilled']:.2f}",
+            f"{100 * row['within']:.0f} %",
+            f"{row['time']:.0f}",
+        ]
+        for name, row in rows.items()
+    ]
+    first, last = next(iter(rows.values()))["seeds"]
+    how = f"five doses of each seed from {first} to {last}"
+    return f"{_table(head, lines)}\n<sub>`python benchmarks/dosing_particles.py --final --json`; {how}.</sub>\n"
 
 
 def command_line() -> str:
