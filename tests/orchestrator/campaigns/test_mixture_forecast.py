@@ -56,12 +56,12 @@ def test_order_sources_errors_and_duration_are_stated(tmp_path: Path) -> None:
 
 
 def test_an_amount_that_source_and_balance_can_not_support_is_refused_with_one_that_they_can(tmp_path: Path) -> None:
-    _, problems = checked(tmp_path, "20 g", "1.5 g")
+    _, problems = checked(tmp_path, "20 g", "1.05 g")
     match = re.search(
         r"12:33: mixtures.wanted.A1.ethanol: ethanol into rack/A1, rack/A2: .* support ([\d.]+) g", problems
     )
     assert match is not None, problems
-    assert float(match[1]) > 1.5
+    assert float(match[1]) > 1.05
     assert "rack/A3" not in problems
 
 
@@ -107,7 +107,7 @@ def test_vessels_places_and_amounts_that_are_impossible_are_refused_at_once(
         "{name: bench, mode: virtual, bench: {liquid: {particles: 400}, operator_time: 60 s}}", str(RACK)
     )
     text = text.replace("floor: 4 mm}}", "floor: 4 mm}, grip: {mass: 1400 g}}").replace(
-        "ethanol: 20 g}\n    A2", "ethanol: 1.5 g}\n    A2"
+        "ethanol: 20 g}\n    A2", "ethanol: 1.05 g}\n    A2"
     )
     path = tmp_path / "mix.yaml"
     path.write_text(text, encoding="utf-8")
