@@ -145,7 +145,8 @@ class OtherEmulator:
 
     def history(self, since: float) -> History:
         now, _ = self.robot.measure()
-        later = [(t, tuple(q.tolist())) for t, q in self.robot.readings if t > since]
+        newest = itertools.takewhile(lambda reading: reading[0] > since, reversed(self.robot.readings))
+        later = [(t, tuple(q.tolist())) for t, q in newest][::-1]
         return History(tuple(t for t, _ in later), tuple(q for _, q in later), now)
 
     def fault(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
