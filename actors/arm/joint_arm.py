@@ -183,14 +183,14 @@ class JointArmSettings(ArmSettings):
     """Objects around the arm: the laboratory's section `cell`."""
 
     @property
+    @abstractmethod
     def kinematics(self) -> ArmModel:
         """The arm's kinematics."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def home_joints(self) -> tuple[float, ...]:
         """The waiting pose of the arm, with the pourer upright [rad]."""
-        raise NotImplementedError
 
     def in_laboratory(self, cell: RobotCell | None, time_scale: float) -> Self:
         """See `ArmSettings.in_laboratory`."""

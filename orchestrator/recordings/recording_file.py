@@ -343,13 +343,17 @@ TENFOLD = (5.0, 20.0)
 """Ratios of a reading to both of its neighbours that a digit or a point more or less explains, and no pour."""
 
 
-def _tenfold(readings: NDArray[np.float64]) -> int | None:
-    """Position of a single reading that is about ten or a tenth times each of its neighbours, which agree."""
+def _tenfold(readings: NDArray[np.float64], step: float) -> int | None:
+    """Position of a single reading that is about ten or a tenth times each of its neighbours, which agree.
+
+    Near an empty balance's zero, readings of a few steps [kg] do that by themselves.
+    """
     before, middle, after = (np.abs(readings[i : len(readings) - 2 + i]) for i in range(3))
     low, high = np.minimum(before, after), np.maximum(before, after)
     larger = (middle > TENFOLD[0] * high) & (middle < TENFOLD[1] * low)
     smaller = (middle < low / TENFOLD[0]) & (middle > high / TENFOLD[1])
-    places = np.flatnonzero((larger | smaller) & (high < 1.5 * low))
+    far = np.abs(middle - high) > max(20.0 * step, 0.02 * float(np.abs(readings).max()))
+    places = np.flatnonzero((larger | smaller) & (high < 1.5 * low) & far)
     return 1 + int(places[0]) if len(places) else None
 
 
@@ -358,7 +362,7 @@ def _masses(
 ) -> tuple[list[Problem], list[Problem]]:
     """Errors and warnings about the readings of a pour."""
     net, step, load = recording.net, float(recording.step), recording.scene.liquid.mass
-    if (alone := _tenfold(recording.readings)) is not None:
+    if (alone := _tenfold(recording.readings, step)) is not None:
         before, reading, after = 1e3 * recording.readings[alone - 1 : alone + 2]
         text = (
             f"this reading is {reading:.6g} g, and those next to it are {before:.6g} and {after:.6g} g: it was damaged "

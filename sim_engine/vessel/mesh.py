@@ -93,12 +93,13 @@ def _check_format(name: str, kind: str, content: bytes) -> None:
 
 def _check_finite(name: str, content: bytes) -> None:
     """Refuse an OBJ file with a vertex that is no number, of which trimesh reads no triangles."""
-    for number, line in enumerate(content.splitlines(), start=1):
-        if re.match(rb"(?i)\s*v\s.*(?:nan|inf)", line):
-            raise VesselError(
-                f"{name}:{number}: a vertex is not a finite number ({line.decode('ascii', 'replace').strip()[:60]}); "
-                "export the mesh again, or remove this vertex and its faces"
-            )
+    if (vertex := re.search(rb"(?im)^[ \t]*v[ \t][^\r\n]*(?:nan|inf)[^\r\n]*", content)) is not None:
+        line = content.count(b"\n", 0, vertex.start()) + 1
+        raise VesselError(
+            f"{name}:{line}: a vertex is not a finite number "
+            f"({vertex[0].decode('ascii', 'replace').strip()[:60]}); export the mesh again, or remove this vertex and "
+            "its faces"
+        )
 
 
 def load_triangles(path: Path) -> Any:

@@ -5,10 +5,12 @@ Its kinematics are in closed form, so that no package of an extra is needed.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import threading
 import time
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -24,6 +26,7 @@ from actors.arm.planned_pour import JointPath
 from actors.arm.ur.robot_models import MODELS
 from actors.arm.ur.ur_kinematics import kinematics_of
 from actors.arm_geometry import JointAngles
+from actors.laboratory_settings import LaboratorySettings
 from sim_engine.settings.model import NOT_IN_FINGERPRINT, Text
 from tests.support.planning_cell import SPEC
 
@@ -176,6 +179,12 @@ def other_arm(**changes: Any) -> OtherArmSettings:
     ).with_values(**changes)
 
 
-def register(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Register the kind as an installed package does."""
-    monkeypatch.setattr(ARMS, "_content", ({**ARMS.all, "other": OtherArmKind}, (), {"other": "a test"}))
+@contextlib.contextmanager
+def registered() -> Iterator[None]:
+    """The kind is registered as an installed package does it, for as long as the context lasts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ARMS, "_content", ({**ARMS.all, "other": OtherArmKind}, (), {"other": "a test"}))
+        # Kinds are read when the first settings are validated, which an earlier test has done.
+        LaboratorySettings.model_rebuild(force=True)
+        yield
+    LaboratorySettings.model_rebuild(force=True)

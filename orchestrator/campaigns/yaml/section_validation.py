@@ -85,6 +85,8 @@ def _guess_variant(variants: set[type[Settings]], data: dict[str, Any], place: P
     """Report that the key that selects the variant is missing or wrong; continue with the best-matching variant."""
     key, word = next(iter(variants)).tag, data.get(next(iter(variants)).tag)
     words = sorted(section.tag_word() for section in variants)
+    if word in words:
+        raise RuntimeError(f"the kind '{word}' was registered after the first {place} had been validated")
     if word is None:
         examples = [keys[key] for section in variants if key in (keys := section.required_keys())]
         text = f"key '{key}' is missing; add for example '{key}: {max(examples)}'"

@@ -5,6 +5,7 @@ the check of a gripper. None of these places names a kind of arm.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from actors.arm.arm_settings import ARMS
 from actors.bench.virtual_bench import FollowedBench
 from actors.grippers.digital_gripper import DigitalSettings
 from actors.laboratory_settings import LaboratorySettings
@@ -28,8 +30,9 @@ pytestmark = pytest.mark.realtime
 
 
 @pytest.fixture(autouse=True)
-def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    other_arm.register(monkeypatch)
+def _registered() -> Iterator[None]:
+    with other_arm.registered():
+        yield
 
 
 def laboratory(folder: Path, name: str = "virtual-dosing", **sections: object) -> Path:
@@ -46,6 +49,17 @@ def spec(folder: Path, scale: float = 1.0) -> LaboratorySettings:
     loaded = load_laboratory(laboratory(folder))
     paced = {name: getattr(loaded, name).with_values(time_scale=scale) for name in ("arm", "balance", "bench")}
     return loaded.with_values(in_process=True, operator=loaded.operator.with_values(time=1.0), **paced)
+
+
+def test_a_kind_that_is_registered_too_late_is_an_error_and_no_endless_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = laboratory(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(ARMS, "_content", ({name: kind for name, kind in ARMS.all.items() if name != "other"}, (), {}))
+        LaboratorySettings.model_rebuild(force=True)
+    with pytest.raises(RuntimeError, match="'other' was registered after"):
+        load_laboratory(path)
 
 
 def test_it_pours_on_a_virtual_bench_and_its_tilt_is_exported(tmp_path: Path) -> None:

@@ -82,6 +82,13 @@ def test_a_recording_keeps_the_times_of_tilt_and_mass(tmp_path: Path) -> None:
     assert not found.warnings
 
 
+def test_readings_of_a_few_steps_near_zero_are_no_damage(tmp_path: Path) -> None:
+    """A tared balance shows 0.1, 0.6, 0.1 g before anything flows."""
+    masses = [0.1, 0.1, 0.6, 0.1, 0.1, *np.linspace(0.1, 60.0, 20).round(1), 60.0, 60.0]
+    rows = [f"{0.1 * k:.1f},{min(3.0 * k, 60.0):g},{mass:g}" for k, mass in enumerate(masses)]
+    assert load_recording(written(tmp_path, rows)).read_times[2] == pytest.approx(0.2)
+
+
 @pytest.mark.parametrize(
     ("header", "rows", "message"),
     [
