@@ -20,7 +20,7 @@ from orchestrator.campaigns.campaign_file import CampaignFile
 from orchestrator.campaigns.file_loading import load_campaign, load_vessel
 from orchestrator.campaigns.file_references import VesselFile
 from orchestrator.campaigns.search_ranges import EXAMPLES
-from orchestrator.campaigns.yaml.section_validation import sections_in
+from orchestrator.campaigns.yaml.section_validation import RENAMED, sections_in
 from orchestrator.cli import console as common
 from orchestrator.daemon.state.daemon_settings import DaemonFile
 from orchestrator.records.journal import Kind
@@ -291,3 +291,14 @@ def test_changelog_has_every_version_that_was_released() -> None:
     headings = set(re.findall(r"^## \[([^\]]+)\]", text_of(ROOT / "CHANGELOG.md"), re.MULTILINE))
     assert {tag.removeprefix("v") for tag in tags.split()} <= headings
     assert "Unreleased" in headings
+
+
+def test_a_section_of_the_changelog_is_short_and_has_every_renamed_key() -> None:
+    """What a user has to do, what is new and what is gone; steps between two releases are in git."""
+    sections = re.split(r"^## ", text_of(ROOT / "CHANGELOG.md"), flags=re.MULTILINE)[1:]
+    words = {section.splitlines()[0]: len(section.split()) for section in sections}
+    assert max(words.values()) <= 2_000, words
+    (section,) = (text for text in sections if re.match(r"\[?0\.3\.0", text))
+    rows = re.findall(r"^\|(.+)\|(.+)\|$", section, re.MULTILINE)
+    for key, now in RENAMED.items():
+        assert any(re.search(rf"\b{key}\b", before) and f"`{now}`" in after for before, after in rows), key

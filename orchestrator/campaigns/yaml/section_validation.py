@@ -252,15 +252,38 @@ REMOVED = {
     "objectives": "weighted sums are gone; give one, as 'objective: {name: target_volume, volume: 150 mL}'",
     "floor": "it is a key of the objective: 'objective: {name: spilled, floor: 0.5}'",
     "risk": "planning under errors of execution is gone; remove it, and 'decant simulate' predicts deviations",
+    "trust": "'model: residual' always believes the simulator, and 'model: adaptive' weighs it by the pours; remove it",
+    "ignorance": "a simulator that seems wrong is weighted accordingly and reported; remove it",
+    "window": "'decant simulate' predicts deviations from an action; remove it",
+    "prices": "simulations run while the arm pours, 'simulations_per_pour' of them; remove it",
     "costs": "simulations run while the arm pours, 'simulations_per_pour' of them; remove it",
 }
 """Remedies for keys of earlier versions."""
+
+RENAMED = {
+    "announcement": "warning_time",
+    "dynamic_viscosity": "viscosity",
+    "gain_below": "min_gain",
+    "hold_cap": "max_hold_time",
+    "initial": "initial_samples",
+    "lip_drop": "rim_correction",
+    "otherwise": "fallback",
+    "per_axis": "points_per_axis",
+    "per_pour": "simulations_per_pour",
+    "rrd": "recording",
+    "untilt_speed": "upright_speed",
+    "viscosity": "xsph_rate",
+}
+"""Keys of version 0.2 and their names since 0.3, which are not the most similar ones."""
 
 
 def _unknown_key(model: type[Settings], loc: Loc, data: Any) -> str:
     key = str(loc[-1])
     if key in REMOVED:
         return f"unknown key; {REMOVED[key]}"
+    keys = _keys(_sections_at(model, loc[:-1], data))
+    if RENAMED.get(key) in keys:
+        return f"unknown key; it is '{RENAMED[key]}' now"
     guess = _meant(model, loc, data)
     if guess is not None:
         return f"unknown key; did you mean '{guess}'?"

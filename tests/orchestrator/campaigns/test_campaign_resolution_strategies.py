@@ -13,6 +13,7 @@ import pytest
 
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.campaigns.yaml.section_validation import RENAMED
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.deployment.objectives import TargetVolume
@@ -179,6 +180,41 @@ def test_a_key_that_is_gone_is_one_error_that_says_so(line: str, expected: str, 
     assert text.count("campaign.yaml:") == 1
 
 
+OF_VERSION_0_2 = f"""\
+name: test
+laboratory: {CONFIGS}/laboratories/virtual.yaml
+liquid: {{density: 998 kg/m^3, dynamic_viscosity: 1 mPa s, mass: 200 g}}
+pourer: {CONFIGS}/vessels/beaker.yaml
+receiver: {CONFIGS}/vessels/tumbler.yaml
+motion: {{max_angle: 110 deg, height: 90 mm, hold_time: until_flow_ends, hold_cap: 3 s}}
+simulator: {{parameters: {{viscosity: [0 1/s, 10 1/s], lip_drop: 0.5}}}}
+calibration:
+  strategy: C1
+  actions: {{angular_velocity: [60 deg/s, 120 deg/s], x_offset: [90 mm, 120 mm]}}
+  pours: {{count: 4}}
+  per_axis: 4
+deployment:
+  strategy: D3
+  actions: {{angular_velocity: [60 deg/s, 120 deg/s], x_offset: [90 mm, 120 mm]}}
+  pours: 6
+  initial: 2
+  per_pour: 4
+  risk_limit: {{loss: 10 %, otherwise: stop}}
+  stop: {{gain_below: 0.2 %}}
+outputs: {{rrd: true}}
+"""
+
+
+def test_the_keys_of_version_0_2_are_errors_with_their_present_names(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as refused:
+        load(tmp_path, OF_VERSION_0_2)
+    text = str(refused.value)
+    for key, now in RENAMED.items():
+        if f"{key}:" in OF_VERSION_0_2:
+            assert f".{key}: unknown key; it is '{now}' now" in text
+    assert text.count("campaign.yaml:") == text.count("unknown key; it is") == 10
+
+
 CONFIRMED = f"""\
 name: test
 laboratory: {CONFIGS}/laboratories/virtual.yaml
@@ -216,12 +252,10 @@ def test_confirming_pours_need_a_bench(tmp_path: Path) -> None:
     ("good", "other", "told"),
     [
         ("deployment:", "outputs: {record_rate: 4 1/s}\ndeployment:", "outputs.record_rate: unknown key; did you mean"),
-        ("strategy: D1", "strategy: D1\n  initial: 4", "deployment.initial: unknown key; did you mean"),
+        ("strategy: D1", "strategy: D1\n  initial: 4", "deployment.initial: unknown key; it is 'initial_samples' now"),
         ("strategy: D1", "strategy: D3\n  pours: 5\n  model: scaled", "deployment.model: 'scaled' is not known here"),
         ("strategy: D1", "strategy: D3\n  pours: 5\n  trust: always", "deployment.trust: unknown key"),
     ],
 )
-def test_a_name_that_only_an_unreleased_version_had_is_unknown(
-    tmp_path: Path, good: str, other: str, told: str
-) -> None:
+def test_a_name_of_an_earlier_version_is_unknown(tmp_path: Path, good: str, other: str, told: str) -> None:
     assert told in refusal(tmp_path, DEPLOYED.replace(good, other))
