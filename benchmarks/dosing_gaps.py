@@ -40,9 +40,10 @@ from typing import Any
 
 import numpy as np
 
-from actors.dosing.dose_controller import DoseController, DoseOrder, DosePhase, TiltCommand
+from actors.dosing.dose_controller import DoseController, DoseOrder, DosePhase
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, SourceContent
+from actors.dosing.tilt_command import TiltCommand
 from actors.dosing.virtual_dosing_bench import TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseEnd

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from actors.dosing.cup_flow import CupFlow
-from actors.dosing.dose_controller import TiltCommand
 from actors.dosing.dose_estimator import DoseReading
+from actors.dosing.tilt_command import TiltCommand
 
 APPROACH, BACK, PARK = math.radians(50.0), math.radians(60.0), math.radians(18.0)
 SEARCH = math.radians(3.5)

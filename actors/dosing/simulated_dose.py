@@ -14,9 +14,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from actors.dosing.dose_controller import DoseController, DoseOrder, DosePhase, DoseResult, TiltCommand
+from actors.dosing.dose_controller import DoseController, DoseOrder, DosePhase, DoseResult
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, after_dose, check_dose, series_of, source_of, unknown_amount
+from actors.dosing.tilt_command import TiltCommand
 from actors.dosing.virtual_dosing_bench import DoseRecord, TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
 from actors.interfaces import (

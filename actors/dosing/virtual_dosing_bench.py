@@ -33,8 +33,8 @@ from numpy.typing import NDArray
 
 from actors.arm.arm_interface import NEWS_TIMEOUT
 from actors.balance.display_behaviour import IDEAL, DisplayBehaviour, DisplayModel
-from actors.dosing.dose_controller import TiltCommand
 from actors.dosing.dose_estimator import DoseReading
+from actors.dosing.tilt_command import TiltCommand
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquids import Liquid
 

@@ -19,9 +19,10 @@ import numpy as np
 from scipy.optimize import brentq
 
 from actors.balance.display_behaviour import DisplayBehaviour
-from actors.dosing.dose_controller import DoseOrder, TiltCommand
+from actors.dosing.dose_controller import DoseOrder
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, SourceContent
+from actors.dosing.tilt_command import TiltCommand
 from actors.dosing.virtual_dosing_bench import DosingFault, TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
 from orchestrator.recordings.recording_file import PourRecording, load_recording, write_recording

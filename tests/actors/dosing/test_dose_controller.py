@@ -20,12 +20,12 @@ from actors.dosing.dose_controller import (
     DoseOrder,
     DosePhase,
     DoseResult,
-    TiltCommand,
     check_display,
     fine_flow,
 )
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, calibrated_knowledge, draw_lags
 from actors.dosing.dose_series import DoseSeries, SourceContent
+from actors.dosing.tilt_command import TiltCommand
 from actors.dosing.virtual_dosing_bench import DoseRecord, DosingFault, TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseEnd, InvalidActionError
@@ -172,19 +172,23 @@ def test_a_knock_on_the_balance_does_not_end_the_dose_early_or_late() -> None:
 def test_one_reading_that_is_wrong_by_a_factor_of_ten_misleads_no_dose(
     phase: DosePhase, place: int, factor: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    taken, seen = DoseController._take, 0
+    decide, seen, empty = DoseController.step, 0, 0.0
     damaged: list[float] = []
 
-    def take(self: DoseController, reading: DoseReading, tilt: float, now: float) -> None:
-        nonlocal seen
-        net = reading.mass - (self._zero or 0.0)
+    def shown(self: DoseController, reading: DoseReading) -> DoseReading:
+        nonlocal seen, empty
+        if self.phase is DosePhase.CHECK:
+            empty = reading.mass
         seen += self.phase is phase
         if seen == place and not damaged:
             damaged.append(reading.mass)
-            reading = replace(reading, mass=reading.mass + (factor - 1.0) * net)
-        taken(self, reading, tilt, now)
+            return replace(reading, mass=reading.mass + (factor - 1.0) * (reading.mass - empty))
+        return reading
 
-    monkeypatch.setattr(DoseController, "_take", take)
+    def step(self: DoseController, time: float, tilt: float, readings: Sequence[DoseReading]) -> TiltCommand:
+        return decide(self, time, tilt, [shown(self, reading) for reading in readings])
+
+    monkeypatch.setattr(DoseController, "step", step)
     record, controller = one_dose(0.01)
     assert damaged
     assert controller.result is not None

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from actors.dosing.cup_flow import CupFlow
-from actors.dosing.dose_controller import DoseController, DoseOrder, TiltCommand
+from actors.dosing.dose_controller import DoseController, DoseOrder
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, SourceContent
+from actors.dosing.tilt_command import TiltCommand
 from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseProgress, PourProgress
