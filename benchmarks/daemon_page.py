@@ -16,10 +16,10 @@ FIGURES, PAGE = DOCS / "data" / "daemon.json", DOCS / "evidence" / "reliability.
 MARKED = re.compile(r"(<!-- measured: ([\w-]+) -->\n).*?(<!-- end of what was measured -->)", re.DOTALL)
 
 UNTIL = {
-    "pause": "the daemon has taken note; the pour goes on by intention",
-    "stop": "likewise",
-    "abort": "the arm has confirmed that it stands",
-    "emergency stop": "likewise",
+    "pause": "noted",
+    "stop": "noted",
+    "abort": "the arm stands",
+    "emergency stop": "the arm stands",
 }
 BENCHES = {"numbers": "", "wires": " over wires"}
 
@@ -60,12 +60,10 @@ def stops(found: Mapping[str, Any]) -> str:
                 if (one["bench"], one["grade"]) == (bench, grade)
             }
             if cells:
-                rows.append((grade + words, until, *(cells.get(load, "") for load in loads)))
-    first = ", ".join(f"{ms}" for ms in found["first simulation of a plan"])
+                rows.append((f"{grade}{words}, until {until}", *(cells.get(load, "") for load in loads)))
     return (
         f"Median / worst of {found['times']} [ms], on {found['cores']} cores with a load of {found['load before']} "
-        f"beforehand; the first simulation of a submitted plan began after {first} ms.\n\n"
-        + markdown_table(("", "until", *loads.values()), rows)
+        "beforehand.\n\n" + markdown_table(("", *loads.values()), rows)
     )
 
 
@@ -78,28 +76,22 @@ def day(found: Mapping[str, Any]) -> str:
         ("scaled time, two rigs", f"{found['hours scaled']:.0f} h in {found['minutes']:.0f} min"),
         ("campaigns", f"{found['campaigns']} ({states})"),
         ("ordered pours", f"{found['orders']} ({ended}), sent again {counts['orders repeated']} times"),
-        ("finished simulations, pours", f"{found['finished']['finished']}, {found['finished']['pour.finished']}"),
         ("`kill -9`, SIGTERM", f"{counts.get('killed', 0)}, {counts.get('ended by SIGTERM', 0)}"),
         ("full disk for 30 s", f"{counts.get('full disks', 0) + counts.get('full disks later', 0)}"),
-        ("restart until it serves, median", f"{found['restart [s]']} s"),
-        ("visits of other clients, connections lost", f"{counts['visits']}, {counts['connections lost']}"),
-        ("campaigns resumed after a fault", f"{sum(n for name, n in counts.items() if name.startswith('resumed'))}"),
         ("pours declared lost after a kill", f"{counts.get('pours declared lost by the operator', 0)}"),
     ]
     begin, end = found["undisturbed [min]"]
-    grown = [(one["what"], one["end"], f"{one['an hour']:+g}") for one in found["at rest"]]
+    hourly = 60 * (found["campaigns"] + found["orders"]) / found["minutes"]
     memory = next(one for one in found["at rest"] if one["what"].startswith("memory of the daemon"))
     return (
         "Two rigs on simulated benches without Ray; in the first part a fault every 90 seconds. Each order is sent "
         "three times or more. If a pour is killed, the operator declares it lost.\n\n"
         + markdown_table(("", ""), rows)
         + "\nLost or doubled, by the journals, the queue and the account of materials: "
-        + ", ".join(f"{name} {count}" for name, count in found["lost or doubled"].items())
+        + (", ".join(f"{name} {count}" for name, count in found["lost or doubled"].items() if count) or "nothing")
         + ".\n"
-        + f"\nBetween campaigns, from minute {begin:.0f} to {end:.0f}, when the daemon was not restarted; "
-        f"{100 * found['cpu share']:.0f} % of a core on average:\n\n"
-        + markdown_table(("", "at the end", "growth in an hour"), grown)
-        + f"\nAt {60 * (found['campaigns'] + found['orders']) / found['minutes']:.0f} campaigns and orders an hour the "
+        + f"\nFrom minute {begin:.0f} to {end:.0f}, when the daemon was not restarted, it took "
+        f"{100 * found['cpu share']:.0f} % of a core on average. At {hourly:.0f} campaigns and orders an hour the "
         f"daemon's memory grew by {memory['an hour']:+.0f} ± {memory['error']:.0f} MB an hour (standard error); the "
         "files of the runs grow until they are removed.\n"
     )

@@ -31,7 +31,6 @@ PLAN: dict[str, tuple[str, ...]] = {
     "engines": ("engines.py",),
     "plan": ("plan_speed.py",),
     "validate": ("validate_cost.py",),
-    "profile": ("profile_passes.py",),
     "pool": ("pool_speed.py",),
 }
 """Measurements by name: script and its arguments."""
@@ -60,16 +59,12 @@ def page_text(records: dict[str, Any]) -> str:
         records: measurements by name, as returned by `measure`.
     """
     pours = pour_records(records)
-    scaling = records["scaling"]
     parts = [
-        sections.introduction(),
+        sections.introduction(pours),
         sections.machines(records.values()),
         *stale(records),
-        sections.targets(pours),
-        sections.beside_the_peer(pours),
-        sections.passes(records["profile"]),
-        sections.cost(scaling),
-        sections.memory(scaling),
+        sections.standard_pour(pours),
+        sections.cost(records["scaling"]),
         sections.start_up(records["start-up"]),
         sections.engines(records["engines"]),
         sections.plan(records["plan"]),
@@ -99,16 +94,14 @@ def stale(records: dict[str, Any]) -> list[str]:
 
 
 def draw(records: dict[str, Any], images: Path) -> None:
-    """Draw the figures that have measurements."""
+    """Draw the figure if its measurements exist."""
     pours = pour_records(records)
     ours = {r["result"]["particles"]: r["result"]["whole"]["cpu_s"] for r in pours}
     if "scaling" in records:
         ours = {row["particles"]: row["cpu_s"] for row in records["scaling"]["result"]["cost"]} | ours
     theirs = [(r["result"]["particles"], r["result"]["peer"]["cpu_s"]) for r in pours if "peer" in r["result"]]
     if theirs:
-        page_figures.cost_figure(images / page_figures.COST, list(ours.items()), theirs, sections.TARGETS)
-    if "profile" in records:
-        page_figures.passes_figure(images / page_figures.PASSES, records["profile"]["result"])
+        page_figures.cost_figure(images / page_figures.COST, list(ours.items()), theirs)
 
 
 def write(folder: Path) -> Path:

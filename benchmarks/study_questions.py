@@ -1,11 +1,11 @@
-"""Answer the six questions of the study of ten worlds (docs/evidence/study-questions.md) from its finished cells.
+"""Answer the six questions of the study of ten worlds (docs/evidence/calibration.md) from its finished cells.
 
     python benchmarks/study_questions.py [runs/study-benches] [--write] [--intervals]
 
 Each value belongs to a world, a virtual bench with its ground truth: the mean over its repetitions (and receivers) of
 differences paired by repetition. The mean over the worlds has a 95 % t interval. `--write` puts the table into
-docs/evidence/results.md. `--intervals` only counts the pours of D3 in their 90 % intervals; with `--write` it stores
-this table in docs/data/results.json.
+docs/evidence/calibration.md. `--intervals` only counts the pours of D3 in their 90 % intervals; with `--write` it
+stores this table in docs/data/results.json.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from orchestrator.study.study_statistics import (
 )
 from sim_engine.prediction_band import LEVEL as INTERVAL
 
-PAGE = ROOT / "docs" / "evidence" / "results.md"
+PAGE = ROOT / "docs" / "evidence" / "calibration.md"
 BEGIN, END = "<!-- measured: worlds -->\n", "<!-- end of measured -->"
 STUDY = ROOT / "configs" / "studies" / "benches.yaml"
 COMMAND = "python benchmarks/study_questions.py"
@@ -179,7 +179,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "runs" / "study-benches")
     parser.add_argument("--study", type=Path, default=STUDY)
-    parser.add_argument("--write", action="store_true", help="write the table into docs/evidence/results.md")
+    parser.add_argument("--write", action="store_true", help="write the table into docs/evidence/calibration.md")
     parser.add_argument("--intervals", action="store_true", help="count the pours of D3 in their 90 %% intervals")
     asked = parser.parse_args()
     study = read_study(asked.study)

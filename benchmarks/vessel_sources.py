@@ -1,6 +1,6 @@
 """Measure the accuracy of `decant vessel`: shipped vessels from each vessel source, with the errors of real tools.
 
-Writes docs/data/vessel-sources.json and the table of docs/evidence/results.md. Run from the project's root:
+Writes docs/data/vessel-sources.json and the table of docs/evidence/particles.md. Run from the project's root:
 python benchmarks/vessel_sources.py
 """
 
@@ -26,7 +26,7 @@ from sim_engine.vessel.shapes import VesselSpec
 from sim_engine.vessel.vessel import Vessel, build_vessel
 from tests.support.measured_vessel import MeasuredVessel, vessel
 
-PAGE, DATA = Path("docs/evidence/results.md"), Path("docs/data/vessel-sources.json")
+PAGE, DATA = Path("docs/evidence/particles.md"), Path("docs/data/vessel-sources.json")
 PARTICLES = 600
 LOAD = 0.15
 OFFSETS = {

@@ -1,11 +1,10 @@
-"""Brings figures and tables of a study into docs/evidence/results.md.
+"""Brings figures and tables of a study into the pages of evidence.
 
     python docs/make_study.py runs/study-NAME/report
 
 Figures go to docs/images/study (benches) or docs/images/paper-study. Tables are between
 `<!-- study: NAME/TABLE ... -->` and `<!-- end of study -->`. What follows the table's name selects rows:
 `mismatch=small/large; strategy=D3`. A column with one selected value is left out, and so are those after `without=`.
-`across=mismatch` gives a column to each value of `mismatch`, in whose cells the figures of a row stand together.
 """
 
 from __future__ import annotations
@@ -17,20 +16,20 @@ import sys
 from pathlib import Path
 
 DOCS = Path(__file__).parent
-PAGE, IMAGES = DOCS / "evidence" / "results.md", DOCS / "images"
+PAGES, IMAGES = sorted((DOCS / "evidence").glob("*.md")), DOCS / "images"
 MARKED = re.compile(
     r"(<!-- study: (?P<study>\w+)/(?P<name>[\w-]+)(?P<wanted>[^>]*) -->\n).*?(?P<end><!-- end of study -->)", re.DOTALL
 )
 FIGURES = {
-    "benches": ("study", ("3b", "6", "final")),
-    "paper": ("paper-study", ("3b", "3c", "4", "5b", "6", "7", "final")),
+    "benches": ("study", ("3b", "6")),
+    "paper": ("paper-study", ("4", "6")),
 }
-"""Folder of the images, and the figures that the page shows, by the name of the study."""
+"""Folder of the images, and the figures that the pages show, by the name of the study."""
 
 
 def table(path: Path, wanted: dict[str, set[str]]) -> str:
     """A CSV of the report as Markdown, a mean and its interval in one cell."""
-    across, without = wanted.pop("across", set()), wanted.pop("without", set())
+    without = wanted.pop("without", set())
     with path.open(encoding="utf-8") as file:
         reader = csv.DictReader(file)
         rows = [row for row in reader if all(row[name] in some for name, some in wanted.items())]
@@ -38,19 +37,8 @@ def table(path: Path, wanted: dict[str, set[str]]) -> str:
     shown = [name for name in names if not name.endswith((", low", ", high")) and len(wanted.get(name, "12")) > 1]
     shown = [name for name in shown if name not in without]
     found = [[cell(row, name) if f"{name}, low" in names else row[name] for name in shown] for row in rows]
-    if across:
-        shown, found = pivoted(shown, found, shown.index(*across))
     lines = [f"| {' | '.join(shown)} |", f"|{'---|' * len(shown)}"]
     return "\n".join([*lines, *(f"| {' | '.join(cells)} |" for cells in found)]) + "\n"
-
-
-def pivoted(head: list[str], rows: list[list[str]], at: int) -> tuple[list[str], list[list[str]]]:
-    """A table with a column for each value of column `at`; the cells behind it stand together, divided by ';'."""
-    values = list(dict.fromkeys(row[at] for row in rows))
-    found: dict[tuple[str, ...], dict[str, str]] = {}
-    for row in rows:
-        found.setdefault(tuple(row[:at]), {})[row[at]] = "; ".join(row[at + 1 :])
-    return [*head[:at], *values], [[*key, *(cells.get(value, "") for value in values)] for key, cells in found.items()]
 
 
 def cell(row: dict[str, str], name: str) -> str:
@@ -83,7 +71,8 @@ def main() -> None:
     (IMAGES / folder).mkdir(parents=True, exist_ok=True)
     for number in numbers:
         shutil.copyfile(report / f"figure-{number}.png", IMAGES / folder / f"figure-{number}.png")
-    PAGE.write_text(fill(PAGE.read_text(encoding="utf-8"), report, study), encoding="utf-8")
+    for page in PAGES:
+        page.write_text(fill(page.read_text(encoding="utf-8"), report, study), encoding="utf-8")
 
 
 if __name__ == "__main__":

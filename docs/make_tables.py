@@ -289,7 +289,7 @@ def counted_claims() -> str:
             (
                 f"First pours after a calibration: {pours[6]} points from their expectation in the mean, {pours[8]} of "
                 f"{pours[3]} in their 90 % intervals",
-                "[first pours](results.md#first-pours-after-a-calibration)",
+                "[first pours](first-pours.md)",
             ),
         ),
     )
@@ -386,12 +386,8 @@ SHOWN_SHARES = (20.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0)
 MEASURED = (
     *(
         "recorded",
-        "limits",
         "convergence",
-        "convergence-fine",
         "halves",
-        "halves-pours",
-        "quickstart-coverage",
         "quickstart-fits",
         "first-pours",
         "misled",
@@ -399,22 +395,15 @@ MEASURED = (
     ),
     *(
         "cliffs",
-        "milder",
-        "ideal",
-        "intervals",
-        "study-intervals",
         "learning",
-        "budgets",
-        "optimizers",
         "viscosity",
         "dribbling",
         "effects",
-        "seeds",
     ),
 )
 """Tables of docs/data/results.json that a page shows."""
 MACHINE = "AMD EPYC, 2 shared cores, Linux x86_64, Python 3.11"
-"""The machine of tables that name no other one, as docs/evidence/results.md says."""
+"""The machine of tables that name no other one, as docs/evidence/calibration.md says."""
 
 
 MEANS_ONLY, HIDDEN = (
@@ -422,6 +411,14 @@ MEANS_ONLY, HIDDEN = (
     ("seed", "seeds", "best of 15"),
 )
 """Tables of which a page shows the means alone, and columns that it leaves out: docs/data/results.json has all."""
+
+
+LEFT_OUT: dict[str, Callable[[Sequence[str]], bool]] = {
+    "first-pours": lambda row: row[0] == "no evidence" and row[1] != "all",
+    "quickstart-fits": lambda row: row[1] != "auto",
+    "effects": lambda row: set(row[2:]) == {"none"},
+}
+"""Rows that a page leaves out, likewise."""
 
 
 def measured(name: str) -> str:
@@ -432,26 +429,21 @@ def measured(name: str) -> str:
         columns = [i for i, title in enumerate(head) if not (title in HIDDEN or title.isdecimal())]
         rows = [[row[i] for i in columns] for row in rows if "mean" in row or "seed" not in head]
         head = [head[i] for i in columns]
+    rows = [row for row in rows if not (name in LEFT_OUT and LEFT_OUT[name](row))]
     machine = "" if found["machine"] == MACHINE else f"{found['machine']}; "
     how = f"<sub>`{found['command']}`; {found['settings']}. {machine}{found['date']}, version {found['version']}.</sub>"
     return f"{_table(head, rows)}\n{how}\n"
 
 
-HARDER = {"round rim": "round rim", "oil": "rapeseed oil", "lag 1 s": "lag of 0.9 to 1.1 s"}
-"""Groups of docs/data/dosing.json that are harder than the first one, and what is different in them."""
-
-DOSE_COLUMNS = (
-    *("mean error g", "bias g", "95 % g", "worst g", "over +1 g", "first dose, 95 % g", "spilled g"),
-    *("50 g weighed, 95 % s", "200 g, 95 % s"),
-)
+DOSE_COLUMNS = (*("mean error g", "95 % g", "over +1 g", "first dose, 95 % g", "spilled g", "50 g weighed, 95 % s"),)
 
 
 def _dose_figures(f: Mapping[str, float]) -> tuple[str, ...]:
     figures = (
-        *(f"{f[key]:.2f}" for key in ("mean", "bias", "p95", "worst")),
+        *(f"{f[key]:.2f}" for key in ("mean", "p95")),
         f"{100 * f['over_1g']:.1f} %",
         *(f"{f[key]:.2f}" for key in ("first_p95", "spill_mean")),
-        *(f"{f[key]:.1f}" for key in ("time_50_p95", "time_200_p95")),
+        f"{f['time_50_p95']:.1f}",
     )
     return tuple(text.replace("-", "−") for text in figures)
 
@@ -468,97 +460,54 @@ def dosing() -> str:
     found = data["groups"]["spout, water, lag 0.1 to 0.5 s"]
     rows = []
     for name, f in found.items():
-        if name in ("paired", "machine", "seeds"):
+        if name in ("paired", "machine", "seeds", "PID, fast"):
             continue
-        more = found["paired"].get(name)
-        than = "–" if more is None else f"{more[0]:+.2f} ({more[1]:+.2f} … {more[2]:+.2f})".replace("-", "−")
-        rows.append((f"**{name}**" if more is None else name, *_dose_figures(f), than))
-    head = ("controller", *DOSE_COLUMNS, "mean error more than particles g")
+        rows.append((name if name in found["paired"] else f"**{name}**", *_dose_figures(f)))
+    head = ("controller", *DOSE_COLUMNS)
     return f"{_table(head, rows)}\n{_poured(found)}"
 
 
-def dosing_harder() -> str:
-    """The figures of Decant's controller in the other groups, beside the rivals' mean errors."""
-    data = json.loads((FOLDER / "data" / "dosing.json").read_text(encoding="utf-8"))["groups"]
-    rivals = ("learned preact", "PID")
-    rows = [
-        (text, *_dose_figures(data[name]["particles"]), *(f"{data[name][one]['mean']:.2f}" for one in rivals))
-        for name, text in HARDER.items()
-    ]
-    head = ("", *DOSE_COLUMNS, *(f"{one}: mean error g" for one in rivals))
-    return f"{_table(head, rows)}\n{_poured(data['oil'])}"
+HARD_G, LEAST_COVERAGE = 0.7, 0.85
+"""Mean error [g] above which the page shows a balance, and coverage below which it does; the data have all."""
+
+SERIES = 300
+"""Doses of a measurement; fewer were made while the weighing of doses was changed."""
 
 
 def dosing_balances() -> str:
-    """Doses with displays that repeat, delay and lose readings: the harder ones."""
-    return _dosing_balances(pairs=False)
-
-
-HARD_G, LEAST_COVERAGE = (0.5, 0.7), 0.85
-"""Mean error [g] above which the page shows a behaviour or a pair of them, and coverage below which it does."""
-
-
-def dosing_pairs() -> str:
-    """The same for the pairs of two behaviours that are harder; docs/data/dosing-balances.json has all."""
-    return _dosing_balances(pairs=True)
-
-
-def _dosing_balances(*, pairs: bool) -> str:
+    """Doses with displays that repeat, delay and lose readings: the harder ones, alone or two together."""
     data = json.loads((FOLDER / "data" / "dosing-balances.json").read_text(encoding="utf-8"))["rows"]
-    data = {name: row for name, row in data.items() if (" + " in name) == pairs}
-    if not data:
-        return "not measured\n"
-    figures = ("mean error g", "95 % g", "worst g", "interval covers", "weighed after s", "false stops")
-    rows, others, again = [], [], []
+    rows, others, fresh = [], [], 0
     for name, row in data.items():
-        now, later = row["now"], row.get("later", {})
-        easy = now["mean"] <= HARD_G[pairs] and now["coverage"] >= LEAST_COVERAGE and not now["false_stops"]
+        again = row.get("later", {}).get("now", {}).get("doses") == SERIES
+        figures = row["later"]["now"] if again else row["now"]
+        easy = figures["mean"] <= HARD_G and figures["coverage"] >= LEAST_COVERAGE and not figures["false_stops"]
         if easy:
-            others.append(now)
-            again.append(later)
+            others.append(figures)
+            fresh += again
             continue
-        low, high = now["mean_interval"]
+        low, high = figures["mean_interval"]
         rows.append(
             (
-                name,
-                f"{now['mean']:.2f} ({low:.2f} … {high:.2f})",
-                f"{now['p95']:.2f}",
-                f"{now['worst']:.1f}",
-                f"{100 * now['coverage']:.0f} %",
-                f"{now['time']:.1f}",
-                str(now["false_stops"]),
-                *_covered_later([later]),
+                name if again else f"{name} †",
+                f"{figures['mean']:.2f} ({low:.2f} … {high:.2f})",
+                f"{figures['p95']:.2f}",
+                f"{figures['worst']:.1f}",
+                f"{100 * figures['coverage']:.0f} %",
+                f"{figures['time']:.1f}",
+                str(figures["false_stops"]),
             )
         )
-    if others:
-        ranges = (
-            ("mean", ".2f", 1),
-            ("p95", ".2f", 1),
-            ("worst", ".1f", 1),
-            ("coverage", ".0f", 100),
-            ("time", ".1f", 1),
-        )
-        cells = []
-        for key, form, factor in ranges:
-            low, high = (factor * end(row[key] for row in others) for end in (min, max))
-            cells.append(f"{low:{form}} to {high:{form}}{' %' if key == 'coverage' else ''}")
-        rows.append((f"{len(others)} others", *cells, "0", *_covered_later(again)))
-    one = next(iter(data.values()))
-    seeds = f"seeds {one['seeds'][0]} to {one['seeds'][1]}; today: seeds from 15000, 300 doses from 16000"
-    how = f"{one['now']['doses']} doses a row, {seeds}"
+    ranges = (("mean", ".2f", 1), ("p95", ".2f", 1), ("worst", ".1f", 1), ("coverage", ".0f", 100), ("time", ".1f", 1))
+    cells = []
+    for key, form, factor in ranges:
+        low, high = (factor * end(row[key] for row in others) for end in (min, max))
+        cells.append(f"{low:{form}} to {high:{form}}{' %' if key == 'coverage' else ''}")
+    rows.append((f"{len(others)} others, {len(others) - fresh} of them †", *cells, "0"))
+    head = ("balance", "mean error g", "95 % g", "worst g", "interval covers", "weighed after s", "false stops")
+    how = f"{SERIES} doses a row, seeds from 16000 (†: from 14000)"
     how += "; all rows: [dosing-balances.json](../data/dosing-balances.json)"
-    head = ("balance", *figures, "today: covers (doses)", "today: false stops")
     return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing_balances.py --final --json`; {how}.</sub>\n"
-
-
-def _covered_later(measured: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
-    """Coverage and false stops of what was measured again after the weighing was changed."""
-    figures = [row["now"] for row in measured if row]
-    doses = sum(one["doses"] for one in figures)
-    if not doses:
-        return "–", "–"
-    covered = sum(one["coverage"] * one["doses"] for one in figures) / doses
-    return f"{100 * covered:.0f} % ({doses})", str(sum(one["false_stops"] for one in figures))
 
 
 GAPS = {
@@ -573,18 +522,15 @@ GAPS = {
 def dosing_gaps() -> str:
     """Doses in which readings, commands or both pause; of docs/data/dosing-balances.json."""
     data = json.loads((FOLDER / "data" / "dosing-balances.json").read_text(encoding="utf-8"))["gaps"]
-    head = ["gap of", "doses", "mean error g", "95 % g", "most above g", "over +1 g", "missed", "false stops", "time s"]
+    head = ["gap of", "doses", "mean error g", "95 % g", "most above g", "over +1 g"]
     rows = [
         [
             name,
             str(one["doses"]),
-            f"{one['mean']:.2f} ({one['mean_interval'][0]:.2f} … {one['mean_interval'][1]:.2f})",
+            f"{one['mean']:.2f}",
             f"{one['p95']:.2f}",
             f"{one['most']:+.2f}",
             str(one["over"]),
-            str(one["ends"].get("missed", 0)),
-            str(one["false_stops"]),
-            f"{one['time']:.1f}",
         ]
         for row, name in GAPS.items()
         if (one := data.get(row)) is not None
@@ -602,13 +548,10 @@ def dosing_faults() -> str:
             row["fault"],
             ", ".join(f"{count} {end}" for end, count in row["ends"].items()),
             f"{row['most_above']:+.1f}" if row["most_above"] > 0.0 else "none",
-            f"{row['misreported']:.1f}",
-            f"{row['spilled']:.1f}",
-            "" if row["upright"] is None else f"{row['upright']:.1f}",
         )
         for row in data["rows"]
     ]
-    head = ("fault", "ends", "most above 100 g", "reported amount off by at most g", "spilled g", "upright after s")
+    head = ("fault", "ends", "most above 100 g")
     first, count = data["seeds"]
     how = f"{count} doses each, seeds from {first}; {data['machine']['date']}"
     return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing.py --faults --json`; {how}.</sub>\n"
@@ -618,22 +561,16 @@ def dosing_particles() -> str:
     """Doses of particles in closed loop."""
     rows = json.loads((FOLDER / "data" / "dosing-particles.json").read_text(encoding="utf-8"))["rows"]
     head = [
-        *("source", "doses", "mean error g", "bias g", "95 % g", "worst g", "over +1 g", "unnoticed", "spilled g"),
-        *("covers", "time s"),
+        *("source", "doses", "mean error g", "95 % g", "worst g", "over +1 g"),
     ]
     lines = [
         [
             name,
             str(row["doses"]),
             f"{row['mean']:.2f}",
-            f"{row['bias']:+.2f}".replace("-", "−"),
             f"{row['p95']:.2f}",
             f"{row['worst']:+.2f}".replace("-", "−"),
             str(row["over"]),
-            str(row["unnoticed"]),
-            f"{row['spilled']:.2f}",
-            f"{100 * row['within']:.0f} %",
-            f"{row['time']:.0f}",
         ]
         for name, row in rows.items()
     ]
@@ -798,9 +735,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "compared-deployment": partial(variants, _arms(study.DeploymentsSettings), Settings),
     **{f"result-{name}": partial(measured, name) for name in MEASURED},
     "dosing-spout": dosing,
-    "dosing-harder": dosing_harder,
     "dosing-balances": dosing_balances,
-    "dosing-pairs": dosing_pairs,
     "dosing-gaps": dosing_gaps,
     "dosing-faults": dosing_faults,
     "dosing-particles": dosing_particles,

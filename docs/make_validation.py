@@ -54,12 +54,15 @@ MIRRORED = ", mirrored"
 SHORT_DASHES = (0, (2, 1))
 """Style of curves of mirrored liquids."""
 
-INTRODUCTION = """# Validation
+INTRODUCTION = """# The solver
 
 <!-- written by docs/make_validation.py; edit the cases, not this page -->
 
-Results of the solver in cases whose outcome is known from theory, experiments or other solvers. Criteria were set
-beforehand. These commands measure everything and write the page:
+{met} of {judged} criteria are met in {cases} cases whose outcome is known from theory, experiments or other solvers.
+{failed}
+
+Criteria were set before the measurements. See also: vessels that were really tilted ([recordings](recordings.md)) and
+[resolution](particles.md). These commands measure everything and write the page:
 
 <!-- needs: checkout and minutes -->
 ```
@@ -67,13 +70,10 @@ python -m benchmarks.validation --full --json > results.json
 python docs/make_validation.py results.json
 ```
 
-`python -m benchmarks.validation CASE` runs one case. Comparisons with liquids that were really poured: [real
-recordings](recordings.md). All values are in [validation.json](../data/validation.json). A row of several quantities
-has the values that fail; if all pass, the one with the largest difference from its reference.
-
-θ of all cases unless they say otherwise: {theta}.
-N is the number of particles. In *mirrored* rows one half of the liquid is simulated and the other is its mirror image,
-as pours of 2,000 particles and more are; the criteria are those of the whole liquid.
+[validation.json](../data/validation.json) has all values. A case has rows for the quantities that fail, with these
+values, and one for all that pass, with its first quantity and the value that is farthest from its reference, with N.
+N: particles. *Mirrored*: one half of the liquid is simulated, the other is its mirror image.
+θ unless a case says otherwise: {theta}.
 """
 
 
@@ -210,28 +210,49 @@ def write_page(
 def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint: str) -> str:
     """The page of some records, in their order; see `write_page`."""
     judged = [m for record in records.values() for m in record["measurements"] if m["judged"]]
-    failed = sum(not m["passed"] for m in judged)
-    parts = [INTRODUCTION.format(theta=theta)]
-    parts.append(f"{len(judged) - failed} of {len(judged)} criteria are met.\n")
+    failing = {
+        name: sum(m["judged"] and not m["passed"] for m in record["measurements"]) for name, record in records.items()
+    }
+    missed = ", ".join(f"{name} ({count})" for name, count in failing.items() if count)
+    parts = [
+        INTRODUCTION.format(
+            met=len(judged) - sum(failing.values()),
+            judged=len(judged),
+            cases=len(records),
+            failed=f"Not met: {missed}." if missed else "None fails.",
+            theta=theta,
+        )
+    ]
     older = {name for name, record in records.items() if record["solver"] != fingerprint}
     if older:
         parts.append(f"† Measured before the solver's sources last changed; again: `{AGAIN} CASE`\n")
     rows = [row for name, record in records.items() for row in _criteria(name, record)]
     if rows:
-        head = ("| case | quantity | N | measured | reference | criterion | met |", "|---|---|---:|---:|---:|---|---|")
+        head = (
+            "| case | quantity | N | measured | reference | criterion | met | mirrored |",
+            "|---|---|---:|---:|---:|---|---|---|",
+        )
         parts.append("\n".join([*head, *rows]) + "\n")
     for name, record in records.items():
+        if not _has_section(record):
+            continue
         parts.append(f"## {record['title']}\n\n{record['about']}{' †' if name in older else ''}\n")
         if record["image"] is not None:
             parts.append(f"![{record['title']}](../{IMAGES}/{record['image']})\n")
     return "\n".join(parts)
 
 
+def _has_section(record: Mapping[str, Any]) -> bool:
+    """Whether there is more to show of a case than its row."""
+    return record["image"] is not None or any(m["judged"] and not m["passed"] for m in record["measurements"])
+
+
 def _criteria(case: str, record: Mapping[str, Any]) -> list[str]:
     """Rows of the table of the criteria.
 
     A row has all numbers of particles of a quantity, or of quantities whose names differ in one word. Of several
-    quantities it has the values that fail, or else the one with the largest difference from its reference.
+    quantities it has the values that fail, or else the one with the largest difference from its reference. What passes
+    in a case has one row, of its first quantity. Mirrored liquids that pass are counted in the last column.
     """
     rows: list[list[Mapping[str, Any]]] = []
     for m in record["measurements"]:
@@ -245,7 +266,20 @@ def _criteria(case: str, record: Mapping[str, Any]) -> list[str]:
                 row.append(m)
     anchor = re.sub(r"[^\w -]", "", record["title"].lower()).replace(" ", "-")
     lines = []
+    shown_rows: list[tuple[list[Mapping[str, Any]], str]] = []
     for row in rows:
+        whole = next(
+            (n for n, (other, _) in reversed(list(enumerate(shown_rows))) if _same_criterion(other, row)), None
+        )
+        if whole is not None and row[0]["name"].endswith(MIRRORED) and all(m["passed"] for m in row):
+            shown_rows[whole] = shown_rows[whole][0], f"{len(row)} of {len(row)}"
+        else:
+            shown_rows.append((row, " "))
+    passing = [(row, mirrored) for row, mirrored in shown_rows if all(m["passed"] for m in row)]
+    for row, mirrored in shown_rows:
+        others = passing[1:] if passing and row is passing[0][0] else []
+        if any(row is other for other, _ in passing[1:]):
+            continue
         names = list(dict.fromkeys(m["name"] for m in row))
         chosen = [m for m in row if not m["passed"]]
         if len(names) == 1 or row[0]["reference"] is None:
@@ -258,14 +292,25 @@ def _criteria(case: str, record: Mapping[str, Any]) -> list[str]:
             values = [v if m["passed"] else f"{v} (**fails**)" for v, m in zip(values, row, strict=True)]
         else:
             words = dict(zip(names, _differing(names), strict=True))
-            places = [f"{words[m['name']]}, N = {m['particles']:,}" for m in chosen]
+            places = [f"{words[m['name']]}, {m['particles']:,}" for m in chosen]
             values = [f"{value} ({place})" for value, place in zip(values, places, strict=True)]
         references = "; ".join(dict.fromkeys(shown(m["reference"], m["unit"]) for m in chosen))
         numbers = "; ".join(f"{n:,}" for n in dict.fromkeys(m["particles"] for m in row))
-        met = f"{sum(m['passed'] for m in row)} of {len(row)}"
-        cells = f"[{case}](#{anchor})", _joined(names), numbers, "; ".join(values), references, row[0]["criterion"]
-        lines.append(f"| {' | '.join(cells)} | {met if all(m['passed'] for m in row) else f'**{met}**'} |")
+        count = sum(len(other) for other, _ in [(row, ""), *others])
+        met = f"{count - sum(not m['passed'] for m in row)} of {count}"
+        both = [int(text.split()[0]) for _, text in [(row, mirrored), *others] if text.strip()]
+        mirrored_met = f"{sum(both)} of {sum(both)}" if both else " "
+        quantity = _joined(names) + (f", and {len(others)} more" if others else "")
+        name = f"[{case}](#{anchor})" if _has_section(record) else f"{case}: {record['title'].lower()}"
+        cells = name, quantity, numbers, "; ".join(values), references, row[0]["criterion"]
+        lines.append(
+            f"| {' | '.join(cells)} | {met if all(m['passed'] for m in row) else f'**{met}**'} | {mirrored_met} |"
+        )
     return lines
+
+
+def _same_criterion(whole: Sequence[Mapping[str, Any]], mirrored: Sequence[Mapping[str, Any]]) -> bool:
+    return all(whole[0][key] == mirrored[0][key] for key in ("criterion", "unit"))
 
 
 def _comparable(row: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

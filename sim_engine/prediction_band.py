@@ -22,7 +22,7 @@ width is that of the normal distribution about each simulation; their mixture is
 is the interval of r that contains a single pour with probability `LEVEL`.
 
 Source: derived here; measured in docs/evidence/validation.md (landing, convergence), and compared with unseen pours in
-docs/evidence/results.md.
+docs/evidence/first-pours.md.
 
 Limitations: the shift of one pour does not determine that of another, or the liquid that stays in the pourer. The
 residual contains s² twice, of the simulation and of the pour that it was compared with. It is subtracted once only, as

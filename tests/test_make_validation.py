@@ -76,18 +76,16 @@ def test_quantities_that_differ_in_one_word_share_a_row_with_the_values_that_fai
     ]
     record = {"title": "Kept", "about": "Liquid.", "solver": "same", "image": None, "measurements": found}
     page = make_validation.page_text({"kept": record}, "", "same")
-    assert "| kept at 60°, 70°, slowly | 500 | 31 mm (70°, N = 500) | 30 mm | within 2 % | **1 of 2** |" in page
+    assert "| kept at 60°, 70°, slowly | 500 | 31 mm (70°, 500) | 30 mm | within 2 % | **1 of 2** |" in page
     found[1]["passed"] = True
     page = make_validation.page_text({"kept": record}, "", "same")
-    assert (
-        "| [kept](#kept) | kept at 60°, 70°, slowly | 500 | 31 mm (70°, N = 500) | 30 mm | within 2 % | 2 of 2 |"
-        in page
-    )
+    assert "| kept: kept | kept at 60°, 70°, slowly | 500 | 31 mm (70°, 500) | 30 mm | within 2 % | 2 of 2 |" in page
     found[1]["name"] = "left at 80°, slowly"
-    assert make_validation.page_text({"kept": record}, "", "same").count("| 1 of 1 |") == 2
+    page = make_validation.page_text({"kept": record}, "", "same")
+    assert "kept at 60°, slowly, and 1 more | 500 | 39.9 mm | 39.8 mm | within 2 % | 2 of 2 |" in page
 
 
-def test_a_mirrored_liquid_has_its_row_below_that_of_the_whole_one_and_its_curve_the_same_colour(
+def test_a_mirrored_liquid_that_passes_is_counted_next_to_the_whole_one_and_its_curve_has_the_same_colour(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def work(simulator: object, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
@@ -96,9 +94,11 @@ def test_a_mirrored_liquid_has_its_row_below_that_of_the_whole_one_and_its_curve
     case = suite.Case("kept", "Kept", "Liquid.", work)
     record = case_record(case, case.run(None, *case.efforts(full=True)))  # type: ignore[arg-type]
     page = make_validation.page_text({"kept": {**record, "solver": "same", "image": None}}, "", "same")
-    rows = [line.split(" | ")[1:4] for line in page.splitlines() if line.startswith("| [kept]")]
-    assert [row[0] for row in rows] == ["height", "height, mirrored", "depth", "depth, mirrored"]
-    assert [row[2] for row in rows[:2]] == ["39.7 mm", "50 mm (**fails**)"]
+    rows = [line.split(" | ")[1:] for line in page.splitlines() if line.startswith("| [kept]")]
+    assert [(row[0], row[2], *row[5:]) for row in rows] == [
+        ("height, and 1 more", "39.7 mm", "2 of 2", "1 of 1 |"),
+        ("height, mirrored", "50 mm (**fails**)", "**0 of 1**", "  |"),
+    ]
     assert "3 of 4 criteria are met" in page
     drawn = saved(make_validation.figure_of(record), monkeypatch).axes[0].get_lines()
     assert [line.get_label() for line in drawn] == ["2,000 particles", "theory", "2,000 particles, mirrored"]

@@ -124,7 +124,7 @@ FORGOTTEN = 1e3
 """Noise of an observation that does not count."""
 MISLED = 1.0 / 22.0
 """ε: probability that a calibration says nothing about the bench of the observations, because something was moved or
-exchanged since. None of the 20 calibrations in docs/evidence/results.md (quickstart) misled; by Laplace's rule of
+exchanged since. None of the 20 calibrations in docs/evidence/calibration.md (quickstart) misled; by Laplace's rule of
 succession the next one does with (0 + 1) / (20 + 2)."""
 DRIFTING, DRIFTS, DRIFTS_FROM = 0.2, (0.002, 0.05), 10
 """Prior probability of a drift; smallest and largest r, log-uniform; and the number of observations from which a drift

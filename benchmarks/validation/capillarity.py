@@ -183,9 +183,8 @@ def droplet_figure(curves: list[Series]) -> Figure:
 
 
 ABOUT = (
-    "20 mL of water's tension, laid 4 mm high on a slippery plane, stand 2√(σ/ρg) sin ½θ high after 2 s: the capillary "
-    "length is 2.7 mm. Coarser than that there is one layer of particles, whatever the contact angle. Over seven "
-    "seeds, puddles at 150° are 6.13 to 6.43 mm high with Taichi, 6.14 to 6.40 mm with Quadrants."
+    "20 mL of water's tension, laid 4 mm high on a slippery plane, stand 2√(σ/ρg) sin ½θ high after 2 s. "
+    "Coarser than the capillary length, 2.7 mm, there is one layer of particles, whatever the contact angle."
 )
 VOLUME, WATER_TENSION, LAID = 20e-6, 0.0728, 0.004
 """Volume of the puddle [m³], its tension [N/m], and its initial height [m]."""

@@ -214,9 +214,9 @@ CASES: tuple[Case, ...] = (
     Case(
         "retention",
         "Slow-tilt retention",
-        "A cup tilted at 3 °/s or slower, and held at each angle until it has stopped to drain, keeps what lies below "
-        "the horizontal plane through its lip (numerical integration over the true geometry). Cylinder, cone and a "
-        "jug with a spout from a mesh. Means of five loads.",
+        "A cup tilted at 3 °/s or slower, and held at each angle until it has stopped to drain, keeps what lies "
+        "below the horizontal plane through its lip (numerical integration). Cylinder, cone and a jug with a "
+        "spout from a mesh; means of five loads.",
         _retention,
     ),
     Case(
@@ -248,8 +248,8 @@ CASES: tuple[Case, ...] = (
     Case(
         "sloshing",
         "Sloshing",
-        "The cup at rest is pushed aside by 6 mm; the velocities are projected on the first lateral mode, whose "
-        "frequency is ω² = g k tanh(kH), k = 1.841/R. Its decay is the solver's own viscosity.",
+        "The cup at rest is pushed aside by 6 mm; the frequency of the first lateral mode is ω² = g k tanh(kH), "
+        "k = 1.841/R.",
         _sloshing,
     ),
     Case(
@@ -262,9 +262,9 @@ CASES: tuple[Case, ...] = (
     Case(
         "dam-break",
         "Dam break",
-        "A column of width a and height 2a collapses in a channel ten spacings wide. Reference: Martin & Moyce 1952, "
-        "n² = 2. Their gate opened in an unknown time: fronts are compared after the delay that fits "
-        "best. Friction of the floor (0.05) replaces the boundary layer that slows the small tank.",
+        "A column of width a and height 2a collapses in a channel ten spacings wide. Reference: Martin & Moyce "
+        "1952, n² = 2; fronts are compared after the delay of their gate that fits best. Friction of the floor "
+        "(0.05) replaces their boundary layer.",
         _dam_break,
     ),
     Case(
@@ -277,9 +277,8 @@ CASES: tuple[Case, ...] = (
     Case(
         "convergence",
         "Convergence",
-        "Spillage of nineteen pours into four receivers, slow to fast, at few particles. Reference: 10,000 particles "
-        "(`benchmarks/convergence.py`). Three pours change by more than 0.02 from 10,000 to 40,000: they splash, and "
-        "without surface tension the spray grows with the number of particles. They are not judged.",
+        "Spillage of nineteen pours into four receivers at few particles. Reference: 10,000 particles "
+        "(`benchmarks/convergence.py`). Three pours splash and do not converge. They are not judged.",
         _convergence,
     ),
     Case(
@@ -306,10 +305,9 @@ CASES: tuple[Case, ...] = (
     Case(
         "dribbling",
         "Onset of dribbling",
-        "Cups tilted to 80° with `lip_adhesion` 1 and a contact angle of 90°: what leaves at a Weber number below 1 "
-        "runs down the outside (momentum flux against the work of adhesion; Kistler & Scriven 1994, Duez et al. 2010). "
-        "Reference: the same fraction from the outflow that 5,000 particles have without the model. This checks flow "
-        "and resolution; the critical number and the film of a flow are the model's own.",
+        "Cups tilted to 80° with `lip_adhesion` 1: what leaves at a Weber number below 1 runs down the "
+        "outside (Kistler & Scriven 1994, Duez et al. 2010). Reference: the same fraction from the outflow of "
+        "5,000 particles without the model, whose critical number is not tested.",
         _dribbling,
     ),
     *(Case(*entry) for entry in viscous_flows.CASES),

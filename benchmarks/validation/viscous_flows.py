@@ -397,9 +397,8 @@ def _mm2(viscosity: float) -> str:
 THETA = SimulationParameters(cohesion=0.0, xsph_rate=0.0)
 
 FLOOR = (
-    "Taylor and Green's vortices in a tank with slippery walls die away as exp(−2νk²t), whatever their speed. What is "
-    "found above the given viscosity is the solver's own: the packing is a weak solid. What is missing is friction at "
-    "walls and surface. The solver was tuned at 2,025 particles."
+    "Taylor and Green's vortices in a tank with slippery walls die away as exp(−2νk²t). What is found above the "
+    "given viscosity is the solver's own. The solver was tuned at 2,025 particles."
 )
 FILM = "A film of 10 mm, ν = 1,000 mm²/s, runs down a plane of 20°: mean velocity g sin α e²/3ν (Nusselt 1916)."
 TUBE = (
@@ -413,11 +412,8 @@ SLOT = (
 DRAINAGE = "A film of 8 mm, ν = 1,000 mm²/s, drains from a vertical wall of 100 mm: e = √(νz/gt) (Jeffreys 1930)."
 PUDDLE = "250 mL are let go on a plane: the radius is 0.894 (gV³t/3ν)^⅛ once they are flat (Huppert 1982)."
 CUP = (
-    "The standard pour with 0.1 and 1 Pa s, at 1,000 kg/m³. Reference: the volume-of-fluid solver interFoam (OpenFOAM "
-    "1912), no-slip walls, cells of 2 mm (made with commit 46022671 by `benchmarks/grid_outflow.py`). With 4, 3 and "
-    "2.5 mm it leaves 0.564, 0.580 and 0.584 of the thicker liquid at 3.1 s. SPlisHSPlasH 2.19 with the viscosity of "
-    "Weiler et al. 2018 is no reference, because it leaves 0.34 with walls of volume maps and 0.50 with walls of "
-    "particles."
+    "The standard pour with 0.1 and 1 Pa s, at 1,000 kg/m³. Reference: the volume-of-fluid solver interFoam "
+    "(OpenFOAM 1912), no-slip walls, cells of 2 mm (made with commit 46022671 by `benchmarks/grid_outflow.py`)."
 )
 
 SIDE, VOLUME = 0.07, 200e-6

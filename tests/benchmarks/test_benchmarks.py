@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -195,7 +196,7 @@ def pour_record(particles: int, cpu_s: float) -> dict[str, Any]:
     return {"command": "python pour", "result": result}
 
 
-def test_page_says_what_is_met_and_what_is_missed(tmp_path: Path) -> None:
+def test_the_page_has_the_times_and_outcomes_of_both_programs(tmp_path: Path) -> None:
     import make_page
 
     records = json.loads((ROOT / "docs" / make_page.DATA).read_text(encoding="utf-8"))
@@ -204,11 +205,9 @@ def test_page_says_what_is_met_and_what_is_missed(tmp_path: Path) -> None:
     (tmp_path / make_page.DATA).parent.mkdir()
     (tmp_path / make_page.DATA).write_text(json.dumps(records))
     page = make_page.write(tmp_path).read_text()
-    assert "| 2,000 | 1.50 | 0.60 | **0.50** | aim reached |" in page
-    assert "| 5,000 | 5.00 | 2.00 | **4.00** | met |" in page
-    assert "| 10,000 | 12.0 | 5.00 | **15.0** | **missed** |" in page
-    assert "| 2,000 | 0.50 | 17.0 | **34** | 22.6 | 17 | 11.3 |" in page  # mirrored, and without the symmetry
-    assert "| 2,000 | mirrored | 0.940 | 0.680 | 0.305 | right | 0.990 | 1.003 |" in page
+    assert re.search(r"\| 2,000 \| \*\*0\.50\*\* \|.*\| 17\.0 \| \*\*34\*\* \| 17 \|", page)  # and without the symmetry
+    assert "takes 0.50 CPU seconds with 2,000" in page
+    assert "| 2,000 | mirrored | 0.940 | 0.680 | 0.305 | right | 0.990 |" in page
     assert "abacus, 10 cores, wood" in page
     assert "`python pour` (today, core 1, load 0.1)" in page
     assert (tmp_path / "images" / "performance-cost.png").stat().st_size > 1000
@@ -220,35 +219,15 @@ def test_the_page_tells_how_long_a_plan_takes() -> None:
     row = {"receiver": "cone", "seconds": 16.24, "cpu_s": 19.0, "simulations": 20, "predicted_spillage": 0.0123}
     result = {"plans": [row], "seconds": 16.2, "limit_s": 15.0, "within_limit": False, "core": None, "machine": MACHINE}
     page = page_sections.plan({"command": "c", "result": result})
-    assert "| cone | 16.2 | 19.0 | 20 | 1.2 % |" in page
-    assert "15 s (median 16.2, **missed**)" in page.replace("\n", " ")
+    assert "cone 16.2 s, with 20 simulations; median 16.2 s" in page.replace("\n", " ")
 
 
-def test_the_page_tells_what_the_check_of_each_file_costs() -> None:
+def test_the_page_has_what_the_check_of_a_file_costs() -> None:
     import page_sections
 
-    seconds = {"a": 0.5, "b": 2.31, "c": 1.0, "d": 0.8, "e": 2.0}
-    files = [{"file": f"configs/{name}.yaml", "cpu_s": cpu_s} for name, cpu_s in seconds.items()]
-    result = {"files": files, "limit_s": 2.0, "within_limit": False}
-    page = page_sections.validate(
-        {"command": "c", "result": {**result, "repeats": 5, "core": None, "machine": MACHINE}}
-    )
-    assert "| `configs/b.yaml` | 2.31 |\n| `configs/e.yaml` | 2.00 |" in page
-    assert "| all others | 0.50 to 0.80 |" in page
-    assert "Required: 2 (**missed**)" in page.replace("\n", " ")
-
-
-def test_a_clock_that_seems_to_save_time_is_called_noise() -> None:
-    import page_sections
-
-    moment = {"share": {"density": 1.0}, "calls_per_step": {"density": 1.3}}
-    result = {"particles": 2000, "whole pour": moment, "in full flow": moment, "explained": 0.9, "machine": MACHINE}
-    noise, cost = (
-        " ".join(page_sections.passes({"command": "profile", "result": {**result, "slower": slower}}).split())
-        for slower in (0.89, 1.25)
-    )
-    assert ("within the noise" in noise, "0.89" in noise) == (True, False)
-    assert ("within the noise" in cost, "1.25 times as long" in cost) == (False, True)
+    files = [{"file": f"configs/{name}.yaml", "cpu_s": cpu_s} for name, cpu_s in (("a", 0.5), ("b", 2.31), ("c", 1.0))]
+    page = page_sections.validate({"command": "c", "result": {"files": files, "core": None, "machine": MACHINE}})
+    assert "takes 0.50 to 2.31 CPU seconds for each of 3 shipped files" in page.replace("\n", " ")
 
 
 def test_page_warns_of_figures_from_different_solvers() -> None:
@@ -282,7 +261,7 @@ def test_what_was_measured_of_the_daemon_stands_on_its_page() -> None:
     ]
     found = {"times": 1, "cores": 2, "load before": 0.1, "first simulation of a plan": [500], "stops": stops}
     written = daemon_page.render(page, {"stops": found})
-    assert "| emergency stop over wires | likewise | 12 / 46 |  |  |" in written
+    assert "| emergency stop over wires, until the arm stands | 12 / 46 |  |  |" in written
 
 
 @pytest.mark.parametrize(

@@ -77,9 +77,9 @@ def test_the_table_of_wrong_simulators_is_of_the_runs_that_were_kept(
     written = page.read_text()
     assert f"| small | D3, `adaptive` | {np.mean(run['poured']):.3f} (" in written
     inside = [low <= lost <= high for low, high, lost in run["bands"]]
-    assert f"| {int(inside[0])} of 1, then {sum(inside[1:])} of 2 |" in written
+    assert f"{int(inside[0])} of 1, then {sum(inside[1:])} of 2" in data.read_text()
     assert "old" not in written
-    assert "| large | D3, `adaptive` | kept | kept | kept |\n" in written
+    assert "| large | D3, `adaptive` | kept | kept |\n" in written
     assert data.read_text().splitlines()[2] == 'large,"D3, `adaptive`",kept,kept,kept,kept,kept,kept'
     assert written.startswith("before")
     assert written.endswith("after\n")

@@ -336,7 +336,7 @@ def played(results: Path) -> dict[tuple[str, int], dict[str, Any]]:
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """How sequences ended, by bench."""
     lines = [
-        "| bench | sequences | faults met | lives | questions about pours | as undisturbed |",
+        "| bench | sequences | faults | lives | questions about pours | as undisturbed |",
         "|---|---|---|---|---|---|",
     ]
     for bench, title in TITLES.items():
@@ -345,9 +345,10 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             met = Counter(text for row in of_bench for text in row["met"])
             met -= Counter(text for row in of_bench for text in row.get("not_struck", ()))
             good = sum(not row["wrong"] for row in of_bench)
-            kinds = ", ".join(f"{text} ({count})" for text, count in sorted(met.items()))
             lives, asked = sum(len(row["ended"]) for row in of_bench), sum(row["asked"] for row in of_bench)
-            lines.append(f"| {title} | {len(of_bench)} | {kinds} | {lives} | {asked} | {good} of {len(of_bench)} |")
+            lines.append(
+                f"| {title} | {len(of_bench)} | {met.total()} | {lives} | {asked} | {good} of {len(of_bench)} |"
+            )
     return "\n".join(lines) + "\n"
 
 

@@ -24,7 +24,6 @@ import asyncio
 import contextlib
 import json
 import random
-import statistics
 import tempfile
 import time
 from collections import Counter
@@ -529,13 +528,11 @@ def table(results: Path) -> list[str]:
         f"| pours, tries, consents | {len(poured)}, {len(cycles)}, {len(faulty) + len(unplanned) + 1} |",
         f"| made twice | {sum(count > 1 for count in poured.values())} |",
         f"| faults; of them with one message | {len(faulty)}; {sum(cycle.messages == 1 for cycle in faulty)} |",
-        f"| consents that ended without a fault | {len(unplanned)} |",
-        f"| a person mended it, and the same pour was made and weighed | {kinds('weighed')} |",
+        f"| a person removed the cause, and the same pour was made and weighed | {kinds('weighed')} |",
         f"| nothing was poured; another run made the pour | {kinds('not poured')} |",
         f"| the pour is UNKNOWN, and its masses were weighed | {kinds('unknown')} |",
         f"| largest imbalance of a cycle, besides injected spills [g] | {1e3 * missing:.2f} |",
         f"| largest error of the account of contents and spill tray [g] | {1e3 * max(c.wrong for c in cycles):.2f} |",
-        f"| bench seconds per second, median | {statistics.median(cycle.pace for cycle in cycles):.1f} |",
         f"| other than it should be | {len([text for end in ends for text in end['wrong']])} |",
     ]
 

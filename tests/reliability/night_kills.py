@@ -350,7 +350,7 @@ def main() -> int:
     options.results = options.results or (MIXTURES if options.mixtures else RESULTS)
     if options.write:
         command = "python -m tests.reliability.night_kills --mixtures"
-        about = [f"Their daemon, killed 30 times with seeds 23 (until its campaign was over) and 26 (`{command}`):", ""]
+        about = [f"Nights of mixtures, their daemon killed 30 times (`{command}`):", ""]
         lines = table(options.results)
         write(PAGE, *(("mixture kills", [*about, *lines]) if options.mixtures else ("night kills", lines)))
         return 0

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.runtime.child_process import child_environment
-from tests.reliability.case import FAULTS, NO_MEANING, TARGETS, Case
+from tests.reliability.case import FAULTS, TARGETS, Case
 from tests.reliability.rig import Rig
 from tests.reliability.strikes import can_mount
 
@@ -90,11 +90,7 @@ def commit() -> str:
 
 
 def run(targets: Sequence[str], jobs: int, results: Path, limit: int | None = None) -> bool:
-    """All cases of some targets, so many processes at a time; whether all of them came to their end.
-
-    How long that took is written down beside them.
-    """
-    begun, before = time.monotonic(), len(found(results))
+    """All cases of some targets, so many processes at a time; whether all of them came to their end."""
     shares = {"program": jobs}  # of those with many cases; a process of each of the others
     tasks = [(target, n, shares.get(target, 1)) for target in targets for n in range(shares.get(target, 1))]
     running: list[subprocess.Popen[bytes]] = []
@@ -112,35 +108,20 @@ def run(targets: Sequence[str], jobs: int, results: Path, limit: int | None = No
         time.sleep(0.2)  # polls the parts that run
         good &= all(process.returncode in (None, 0) for process in running)
         running = [process for process in running if process.poll() is None]
-    if good:
-        head = {"wall_s": round(time.monotonic() - begun), "jobs": jobs, "run": len(found(results)) - before}
-        with results.open("a", encoding="utf-8") as out:
-            out.write(json.dumps(head) + "\n")
     return good
 
 
 # ---- tables
 
 
-def wall(results: Path) -> str:
-    """How long all cases took where they were run in one go; else nothing."""
-    lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
-    heads = [head for head in map(json.loads, lines) if "wall_s" in head]
-    if not heads or heads[-1]["run"] < len(found(results)):
-        return ""
-    return f", and {heads[-1]['wall_s'] / 60:.0f} minutes by the clock with {heads[-1]['jobs']} at a time"
-
-
-def table(rows: Sequence[dict[str, Any]], took: str) -> str:
-    """By target: faults, ends of the first lives, and unknown pours; what all of it took. The list has each case."""
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """By target: faults, ends of the first lives, and unknown pours. The list has each case."""
     groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
         groups[row["case"]["target"]].append(row)
     wrong = sum(bool(row["wrong"]) for row in rows)
-    cpu = sum(row["cpu_s"] for row in rows)
     lines = [
-        f"{len(rows)} cases were run, {wrong} ended otherwise than they should. They took {cpu:.0f} seconds of a core: "
-        f"{cpu / 120:.0f} minutes of two{took}.",
+        f"{len(rows)} cases were run, {wrong} ended otherwise than they should.",
         "",
         "| struck | faults | the first life of the program | unknown pours | as undisturbed |",
         "|---|---|---|---|---|",
@@ -160,30 +141,13 @@ def counted(words: Any) -> str:
     return ", ".join(f"{text} ({count})" for text, count in sorted(Counter(words).items()))
 
 
-def reasons() -> str:
-    """What isn't tried, and why."""
-    by_reason: dict[str, dict[str, list[str]]] = defaultdict(dict)
-    for (target, fault), why in NO_MEANING.items():
-        by_reason[why].setdefault(target, []).append(fault)
-    lines = []
-    for why, targets in by_reason.items():
-        faults = dict.fromkeys(fault for some in targets.values() for fault in some)
-        lines.append(f"- {', '.join(targets)}; {', '.join(faults)}: {why}\n")
-    return "".join(lines)
-
-
 def write(results: Path) -> int:
     """The tables of what is in a file of results; returns how many cases went wrong."""
     rows = list(found(results).values())
     page = PAGE.read_text(encoding="utf-8")
-    for name, text in (
-        ("kill matrix", table(rows, wall(results))),
-        ("no meaning", reasons()),
-    ):
-        before, marker, rest = page.partition(BEGIN.format(name))
-        assert marker, f"{PAGE} has no place for the table '{name}'"
-        page = before + BEGIN.format(name) + text + END + rest.partition(END)[2]
-    PAGE.write_text(page, encoding="utf-8")
+    before, marker, rest = page.partition(BEGIN.format("kill matrix"))
+    assert marker, f"{PAGE} has no place for the table of the kill matrix"
+    PAGE.write_text(before + marker + table(rows) + END + rest.partition(END)[2], encoding="utf-8")
     order = {name: i for i, name in enumerate((*TARGETS, *FAULTS))}
     rows.sort(key=lambda row: (order[row["case"]["target"]], order[row["case"]["fault"]]))
     with LIST.open("w", encoding="utf-8", newline="") as file:
