@@ -119,7 +119,7 @@ class WorkerProcess:
 
     def __init__(self, clock: DeviceClock) -> None:
         self._clock = clock
-        self._child = ConnectedProcess("actors.arm.ur.rtde_worker")
+        self._child = ConnectedProcess("actors.arm.ur.rtde_worker", prompt=True)
         self._connection = self._child.connection
         self.pid = self._child.pid
         self._sending = threading.Lock()

@@ -52,7 +52,7 @@ class FarProcess:
         """Address of the line; it stays the same when the line is unplugged and plugged in again."""
         self._lock = threading.Lock()
         text = json.dumps({**settings, "link": self._link, "baud": baud, "tcp": tcp})
-        self._process = ChildProcess(python_module(self.module, text))
+        self._process = ChildProcess(python_module(self.module, text), prompt=True)
         try:
             self.port = self._answer()["port"]
         except BaseException:

@@ -81,7 +81,7 @@ class VirtualController:
         command += ["--polyscope-x"] if polyscope_x else []
         command += ["--clock", clock] if clock else []
         command += [] if joints is None else ["--joints=" + ",".join(repr(degrees(q)) for q in joints)]
-        process = ChildProcess(command)
+        process = ChildProcess(command, prompt=True)
         try:
             ready = json.loads(process.read_line(timeout))
             return cls(process, address, int(ready["fault_port"]))

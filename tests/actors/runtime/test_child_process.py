@@ -6,10 +6,12 @@ from __future__ import annotations
 
 import ast
 import os
+import platform
 import re
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator, MutableMapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -325,3 +327,34 @@ def test_rays_private_api_is_used_in_one_function_only() -> None:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and re.search(r"\bray\._", ast.unparse(node))
     }
     assert found == {("actors/runtime/ray_runtime.py", "_ray_internals")}
+
+
+SLICE = """
+import ctypes, struct, threading
+def shown():
+    attributes = ctypes.create_string_buffer(48)
+    assert ctypes.CDLL(None).syscall({number}, 0, attributes, 48, 0) == 0
+    _, _, _, nice, _, runtime, _, _ = struct.unpack("=IIQiIQQQ", attributes.raw)
+    print((nice, runtime), flush=True)
+input()
+thread = threading.Thread(target=shown)
+thread.start()
+thread.join()
+"""
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "aarch64"), reason="the number of the system call")
+def test_a_prompt_child_and_its_threads_get_short_slices_and_keep_their_priority() -> None:
+    if tuple(int(n) for n in platform.release().split(".")[:2]) < (6, 12):
+        pytest.skip("Linux before 6.12 has no slices")
+    code = SLICE.format(number={"x86_64": 315, "aarch64": 275}[platform.machine()])
+    shown = []
+    for prompt in (False, True):
+        child = ChildProcess([sys.executable, "-c", code], prompt=prompt)
+        child.write(b"\n")
+        shown.append(child.read_line(deadline=PATIENCE).decode().strip())
+        child.close()
+    nice = os.getpriority(os.PRIO_PROCESS, 0)
+    assert shown[1] == f"({nice}, 100000)", shown
+    assert shown[0].startswith(f"({nice}, ")
+    assert shown[0] != shown[1]
