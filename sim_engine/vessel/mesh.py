@@ -253,7 +253,7 @@ def scale_of(extent: float, shape: MeshFile) -> float:
         if not SMALLEST / 4.0 <= size <= 2.0 * LARGEST:
             raise VesselError(
                 f"{shape.path.name}: its largest extent of {extent:.4g} {shape.unit} is not a vessel's size "
-                f"({1e3 * SMALLEST / 4.0:g} … {2e3 * LARGEST:g} mm); is its unit {_likely(extent)}?"
+                f"({1e3 * SMALLEST / 4.0:g} … {2e3 * LARGEST:g} mm); state its unit: {_likely(extent)}"
             )
         return UNITS[shape.unit]
     if not SMALLEST <= extent <= LARGEST:
@@ -266,7 +266,7 @@ def scale_of(extent: float, shape: MeshFile) -> float:
 
 def _likely(extent: float) -> str:
     fitting = [u for u in ("m", "mm", "cm", "in") if SMALLEST <= extent * UNITS[u] <= LARGEST]
-    return " or ".join(f"'{u}' ({1e3 * extent * UNITS[u]:.4g} mm)" for u in fitting) or "none of m, cm, mm, in fits"
+    return " or ".join(f"'{u}' ({1e3 * extent * UNITS[u]:.4g} mm)" for u in fitting) or "none of m, cm, mm and in fits; save it in another scale"
 
 
 def to_z(up: str) -> Floats:

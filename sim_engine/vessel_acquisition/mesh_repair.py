@@ -64,9 +64,9 @@ LARGE_HOLE = 0.01
 ARC, ALL_AROUND, ARC_HEIGHT = 30.0, 330.0, 0.15
 """Angles around the axis between which a hole is a missing part of the wall [deg], and its least height as a share of
 the vessel's. Smaller holes are closed, larger ones are openings. A flat patch across 30° lies 3 % of the radius
-inside."""
+inside. A gap in the rim lowers the lip however narrow it is; a slanted rim falls over a wider angle than a gap."""
 
-RIM, COMPACT = 0.98, 0.5
+RIM, COMPACT = 0.98, 0.45
 """Share of the vessel's height from which a hole goes through the rim; share of its box that another one takes."""
 
 BESIDE = 1e-4
@@ -356,9 +356,12 @@ def _without_holes(vertices: Floats, faces: Integers, wall: float | None, log: _
         # an inner and an outer surface without a rim between them: closed each by itself, they would hold nothing
         around = [bool(np.ptp(upright[loop, :2], axis=0).min() > 0.5 * width) for loop in loops]
         small = [loop for loop, each in zip(loops, around, strict=True) if sum(around) < 2 or not each]
-    if arcs := [arc for loop in small if (arc := _missing_arc(upright, loop)) is not None]:
+    arcs = [arc for loop in small if (arc := _missing_arc(upright, loop)) is not None]
+    if opening and (gap := _gap_in_rim(upright, edge := loops[int(lengths.argmax())])) is not None:
+        arcs, small = [*arcs, gap], [*small, edge]
+    if arcs:
         raise MissingWallError(
-            f"{log.path.name}: a part of its wall is missing: {' and '.join(map(str, arcs))}. What closes so large a "
+            f"{log.path.name}: a part of its wall is missing: {' and '.join(map(str, arcs))}. What closes such a "
             "hole is a guess: scan the vessel again from that side, close the hole in a mesh program, or describe the "
             "vessel by --height and --diameters (vessel profile)",
             upright[np.unique(faces)],
@@ -395,21 +398,40 @@ def _missing_arc(upright: Floats, loop: Integers) -> MissingArc | None:
     corners = corners[np.linalg.norm(corners[:, :2] - middle, axis=1) > 0.25 * float(np.min((high - low)[:2]))]
     if len(corners) < 3:
         return None
-    x, y = (corners[:, :2] - middle).T
-    angles = np.sort(np.degrees(np.arctan2(y, x)) % 360.0)
-    gaps = np.diff(np.append(angles, angles[0] + 360.0))
-    widest = int(np.argmax(gaps))
-    begin, span = float(angles[(widest + 1) % len(angles)]), 360.0 - float(gaps[widest])
+    angles, begin, span = _around(corners[:, :2] - middle)
     bottom, top = float(corners[:, 2].min() - low[2]), float(corners[:, 2].max() - low[2])
     height = float(high[2] - low[2])
-    if not ARC <= span <= ALL_AROUND or top - bottom < ARC_HEIGHT * height:
+    if span > ALL_AROUND or top - bottom < ARC_HEIGHT * height:
         return None
     # a hole through the rim has an inner and an outer edge; another one fills its box, and a chain of gaps does not
-    around = (np.degrees(np.arctan2(y, x)) - begin) % 360.0
+    around = (angles - begin) % 360.0
     enclosed = 0.5 * abs(float(np.sum(around * np.roll(corners[:, 2], -1) - np.roll(around, -1) * corners[:, 2])))
-    if top < RIM * height and enclosed < COMPACT * span * (top - bottom):
+    if span < ARC if enclosed >= COMPACT * span * (top - bottom) else top < RIM * height:
         return None
     return MissingArc(begin, begin + span, bottom, top)
+
+
+def _gap_in_rim(upright: Floats, edge: Integers) -> MissingArc | None:
+    """The part of a sheet's wall that is missing below the edge of its opening; None if the rim is level or slanted."""
+    low, high = upright.min(axis=0), upright.max(axis=0)
+    angles, _, _ = _around(upright[edge, :2] - 0.5 * (low + high)[:2])
+    heights = upright[edge, 2] - low[2]
+    top, bottom = float(np.quantile(heights, 0.9)), float(heights.min())
+    turned = np.abs((np.roll(angles, -1) - angles + 180.0) % 360.0 - 180.0)
+    middle = (0.5 * (heights + np.roll(heights, -1)) - bottom) / max(top - bottom, 1e-9)
+    if top - bottom < ARC_HEIGHT * (high[2] - low[2]) or turned[(middle > 0.1) & (middle < 0.9)].sum() > ARC:
+        return None
+    _, begin, span = _around(upright[edge[heights < 0.5 * (top + bottom)], :2] - 0.5 * (low + high)[:2])
+    return MissingArc(begin, begin + span, bottom, top)
+
+
+def _around(corners: Floats) -> tuple[Floats, float, float]:
+    """Angles of corners around the axis, (N,); the angle from which they take up the least, and how much [deg]."""
+    angles = np.degrees(np.arctan2(corners[:, 1], corners[:, 0])) % 360.0
+    ordered = np.sort(angles)
+    gaps = np.diff(np.append(ordered, ordered[0] + 360.0))
+    widest = int(np.argmax(gaps))
+    return angles, float(ordered[(widest + 1) % len(ordered)]), 360.0 - float(gaps[widest])
 
 
 def _is_sheet(vertices: Floats, faces: Integers) -> bool:

@@ -375,8 +375,10 @@ def test_a_thin_wall_of_a_round_vessel_is_thickened_with_a_note(
     assert "wall: 1.2" in out.read_text()
 
 
-def glass(path: Path, *, missing: str = "", chamber: bool = False, scale: float = 1.0) -> Path:
-    """A glass of 311 mL, perhaps without 60° of a wall, or with a closed chamber in it."""
+def glass(
+    path: Path, *, missing: str = "", width: float = 60.0, slant: float = 0.0, chamber: bool = False, scale: float = 1.0
+) -> Path:
+    """A glass of 311 mL, perhaps without an arc of a wall [deg], slanted [mm], or with a closed chamber in it."""
     around = np.linspace(0.0, 2.0 * np.pi, 73)
 
     def surface(points: list[tuple[float, float]], keep: Callable[[float, float], bool]) -> list[list[np.ndarray]]:
@@ -396,7 +398,7 @@ def glass(path: Path, *, missing: str = "", chamber: bool = False, scale: float 
         return triangles
 
     def arc(angle: float, z: float) -> bool:
-        return not 30.0 <= angle < 90.0
+        return not 29.9 <= angle < 29.9 + width
 
     inner = [(0.0, 4.0), (30.0, 4.0), (33.0, 50.0), (36.0, 95.0)]
     outer = [(39.0, 95.0), (36.0, 50.0), (34.0, 0.0)]
@@ -404,14 +406,18 @@ def glass(path: Path, *, missing: str = "", chamber: bool = False, scale: float 
     if missing == "outer wall":
         triangles = surface([*inner, outer[0]], lambda angle, z: True) + surface(outer, arc)
         triangles += surface([outer[-1], (0.0, 0.0)], lambda angle, z: True)
-    elif missing == "rim":
-        triangles = surface(whole, lambda angle, z: z < 70.0 or arc(angle, z))
+    elif missing == "inner wall":
+        triangles = surface(inner[:2], lambda angle, z: True) + surface(inner[1:], arc)
+        triangles += surface([inner[-1], *outer, (0.0, 0.0)], lambda angle, z: True)
+    elif missing in {"rim", "rim of a sheet"}:
+        triangles = surface(whole if missing == "rim" else inner, lambda angle, z: z < 70.0 or arc(angle, z))
     else:
         triangles = surface(whole, lambda angle, z: True)
     if chamber:
         ring = [(34.5, 60.0), (35.5, 60.0), (36.0, 80.0), (35.3, 80.0), (34.5, 60.0)]
         triangles += [t[::-1] for t in surface(ring, lambda angle, z: True)]
     corners = scale * np.array(triangles)
+    corners[..., 2] += slant * corners[..., 2] / 95.0 * corners[..., 0] / 78.0
     mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
     mesh.merge_vertices()
     mesh.update_faces(mesh.nondegenerate_faces())
@@ -419,17 +425,31 @@ def glass(path: Path, *, missing: str = "", chamber: bool = False, scale: float 
     return path
 
 
-@pytest.mark.parametrize(("missing", "heights"), [("outer wall", "0 to 95 mm"), ("rim", "70 to 95 mm")])
+@pytest.mark.parametrize(
+    ("missing", "width", "where"),
+    [
+        ("outer wall", 60.0, "60° around the axis (30° to 90° from x), 0 to 95 mm above the underside"),
+        ("inner wall", 60.0, "60° around the axis (30° to 90° from x), 4 to 95 mm above the underside"),
+        ("rim", 60.0, "60° around the axis (30° to 90° from x), 70 to 95 mm above the underside"),
+        ("rim", 10.0, "10° around the axis (30° to 40° from x), 70 to 95 mm above the underside"),
+        ("rim of a sheet", 60.0, "60° around the axis (30° to 90° from x), 66 to 91 mm above the underside"),
+    ],
+)
 def test_a_wall_without_an_arc_is_refused_with_what_is_missing_and_a_picture(
-    missing: str, heights: str, tmp_path: Path
+    missing: str, width: float, where: str, tmp_path: Path
 ) -> None:
-    scan = glass(tmp_path / "scan.stl", missing=missing)
-    ended = CliRunner().invoke(app, ["vessel", "mesh", str(scan), str(tmp_path / "v.yaml"), "--unit", "mm"])
+    scan = glass(tmp_path / "scan.stl", missing=missing, width=width)
+    command = ["vessel", "mesh", str(scan), str(tmp_path / "v.yaml"), "--unit", "mm", "--wall", "2 mm"]
+    ended = CliRunner().invoke(app, command)
     assert ended.exit_code == 2
-    text = " ".join(ended.output.split())
-    assert f"55° around the axis (35° to 90° from x), {heights} above the underside" in text
+    assert where in " ".join(ended.output.split())
     assert (tmp_path / "v.png").is_file()
     assert not (tmp_path / "v.yaml").exists()
+
+
+def test_a_slanted_rim_of_a_sheet_is_no_gap(tmp_path: Path) -> None:
+    scan = glass(tmp_path / "scoop.stl", missing="rim of a sheet", width=0.0, slant=30.0)
+    assert capacity(mended(scan, unit="mm", wall=0.002)) == pytest.approx(311.0 * 81.0 / 95.0, rel=0.05)
 
 
 def test_a_stated_unit_does_not_hide_an_implausible_size(tmp_path: Path) -> None:
