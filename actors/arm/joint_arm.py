@@ -203,8 +203,18 @@ class JointArmSettings(ArmSettings):
 
     @property
     def tilt_speed_limit(self) -> float:
-        """See `ArmSettings.tilt_speed_limit`."""
-        return self.limits.tilt_speed
+        """See `ArmSettings.tilt_speed_limit`; the limit of the last joint too, if the pourer turns about its axis."""
+        import numpy as np
+
+        from actors.arm.planning.kinematics import transform_of
+
+        home = np.array([self.home_joints, self.home_joints])
+        home[1, -1] += 1.0
+        before, after = self.kinematics.forward(home)[0]
+        held = (transform_of(self.tool) @ transform_of(self.grip)).rotation
+        if (held.T @ before.T @ after @ held)[1, 1] < 1.0 - 1e-6:
+            return self.limits.tilt_speed
+        return min(self.limits.tilt_speed, self.limits.joint_speed, self.kinematics.joint_speed[-1])
 
     @property
     def upright_time(self) -> float:

@@ -175,8 +175,7 @@ def _too_fast(actions: Space, scene: Scene, name: str, most: float) -> Senseless
     return (
         _where(actions, name),
         f"goes up to {axis.upper / unit.factor:.4g} {unit.display_unit}, and the arm turns the pourer at "
-        f"{most / unit.factor:.4g} {unit.display_unit} at most (arm.limits.tilt_speed): the search "
-        "ends there",
+        f"{most / unit.factor:.4g} {unit.display_unit} at most (arm.limits): the search ends there",
     )
 
 

@@ -59,10 +59,13 @@ def simulate(
     """Simulate one pour of a campaign's scene with several seeds, and print the fate of the liquid.
 
     Values of `--set` without a unit are in deg, deg/s, deg/s^2, mm and s; values that the campaign fixes can be left
-    out. With `--json`, fractions are of the load: received + spilled + retained + in_flight + escaped = 1. They are of
-    the first seed, as are the recording and the picture. 'prediction' contains means and standard deviations of all
-    seeds, and the interval that should contain nine pours in ten.
+    out. An action that the laboratory's arm can't make is simulated with a warning. With `--json`, fractions are of the
+    load: received + spilled + retained + in_flight + escaped = 1. They are of the first seed, as are the recording and
+    the picture. 'prediction' contains means and standard deviations of all seeds, and the interval that should contain
+    nine pours in ten.
     """
+    from actors.arm.pour_feasibility import path_of
+    from actors.interfaces import InvalidActionError
     from orchestrator.campaigns.file_loading import load_discrepancy, load_parameters, load_vessel
     from orchestrator.cli.foreground_run import read_campaign, read_draws
     from sim_engine.prediction_band import band_of, spreads
@@ -84,6 +87,11 @@ def simulate(
     with Refused(InvalidSceneError, at="with shapes that the vessels may have, " if scene.uncertain else ""):
         for task in tasks if scene.uncertain else tasks[:1]:  # refuse before Taichi starts
             simulator.prepare(task)
+    if plan.laboratory.arm is not None:
+        try:
+            path_of(scene, action, plan.laboratory.expected_arm)
+        except InvalidActionError as error:
+            print_warning(f"{action.display()}: {error}")
     regime = _regimes(tasks[0])
     runs = _simulated_pour(simulator, tasks)
     outcomes = [run.outcome for run in runs]

@@ -266,7 +266,10 @@ def scale_of(extent: float, shape: MeshFile) -> float:
 
 def _likely(extent: float) -> str:
     fitting = [u for u in ("m", "mm", "cm", "in") if SMALLEST <= extent * UNITS[u] <= LARGEST]
-    return " or ".join(f"'{u}' ({1e3 * extent * UNITS[u]:.4g} mm)" for u in fitting) or "none of m, cm, mm and in fits; save it in another scale"
+    return (
+        " or ".join(f"'{u}' ({1e3 * extent * UNITS[u]:.4g} mm)" for u in fitting)
+        or "none of m, cm, mm and in fits; save it in another scale"
+    )
 
 
 def to_z(up: str) -> Floats:

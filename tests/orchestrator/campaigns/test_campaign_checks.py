@@ -81,10 +81,10 @@ def test_tilts_faster_than_the_laboratory_allows_are_told_with_the_limit(tmp_pat
     (told,) = warnings(write(tmp_path, "bad.yaml", fast))
     assert told == (
         f"bad.yaml:{LINE - 1}:23: deployment.actions.angular_velocity: deployment into 'narrow': goes up to 200 deg/s, "
-        "and the arm turns the pourer at 160 deg/s at most (arm.limits.tilt_speed): the search ends there"
+        "and the arm turns the pourer at 150 deg/s at most (arm.limits): the search ends there"
     )
-    # at 200 deg/s² a turn of 120 deg comes to 155 deg/s on its way
-    slow = fast.replace("angular_acceleration: 600 deg/s^2", "angular_acceleration: 200 deg/s^2")
+    # at 180 deg/s² a turn of 120 deg comes to 147 deg/s on its way
+    slow = fast.replace("angular_acceleration: 600 deg/s^2", "angular_acceleration: 180 deg/s^2")
     assert warnings(write(tmp_path, "good.yaml", slow)) == []
 
 
@@ -95,10 +95,10 @@ def test_a_search_without_simulations_ends_at_the_speed_of_the_arm_too(tmp_path:
     assert plan.calibration is not None
     assert plan.deployment is not None
     for stage in (plan.calibration, plan.deployment):
-        assert stage.constraints == (Linear((("angular_velocity", 1.0),), math.radians(160.0)),)
+        assert stage.constraints == (Linear((("angular_velocity", 1.0),), math.radians(150.0)),)
     searching = replace(plan.deployment, settings=D2Settings(pours=12))
     played = StrategyHarness(narrow_cup).run(RealOnly(searching, searching.scenes[0], plan.parameters, 3))
-    assert max(pour.action.angular_velocity for pour in played.pours) <= math.radians(160.0) + 1e-9
+    assert max(pour.action.angular_velocity for pour in played.pours) <= math.radians(150.0) + 1e-9
     assert load_campaign(write(tmp_path, "slow.yaml", QUICKSTART)).deployment.constraints == ()
 
 

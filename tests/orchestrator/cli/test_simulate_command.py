@@ -8,13 +8,18 @@ import re
 import subprocess
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
+from orchestrator.cli import simulate_command
+from orchestrator.cli.console import RefusalError
 from orchestrator.cli.simulate_command import told
 from sim_engine.prediction_band import spreads
 from tests.support import example_run
 from tests.support.cli_inputs import SIMULATE, invoke, process
+
+CONFIGS = Path(__file__).parents[3] / "configs"
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +69,20 @@ def test_simulate_predicts_with_the_spread_of_its_seeds_and_says_what_it_lacks(
     assert outcome["delivered_ml"] == pytest.approx(outcome["delivered_g"] / 0.998)
     assert outcome["not_covered"] == []
     assert "not simulated" not in simulated.stderr
+
+
+def test_an_action_that_the_laboratorys_arm_can_not_make_is_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(simulate_command, "_simulated_pour", Mock(side_effect=RefusalError("not simulated here")))
+    shipped = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8")
+    fast = shipped.replace("150 deg/s]", "200 deg/s]").replace(": ../", f": {CONFIGS}/")
+    (tmp_path / "fast.yaml").write_text(fast, encoding="utf-8")
+    for speed, warned in ((150, False), (155, True)):
+        with contextlib.chdir(tmp_path):
+            done = invoke(f"simulate fast.yaml --set angular_velocity={speed} --set x_offset=100")
+        said = "can't make this pour: joint 6 (wrist 3) would turn at 155.1 deg/s" in done.stderr
+        assert said == warned, done.stderr
 
 
 @pytest.mark.slow
