@@ -33,6 +33,7 @@ _MOST = 4
 
 _COUNTED = re.compile(r"(?i)(?:%|\b(?:pcs?|stk|lb:oz|pcs/\w+)\b|\blb +[0-9.]+ *oz\b)")
 _LABEL = re.compile(rb"\s*(?:(G|GS|GROSS|B)|(N|NT|NET)|(T|TR|PT|TARE))\b[\s:.,#]*[-+]?\s*[0-9.]+", re.IGNORECASE)
+_UNMARKED = re.compile(rb"[ -] [ 0-9.]{6}[0-9] (?:[A-Za-z] ?|[A-Za-z]{2})")  # sign in 2, value in 7, unit in 3
 _TEXT = frozenset((*range(0x20, 0x7F), 0x0A, 0x0D))
 
 
@@ -240,6 +241,11 @@ def explain_capture(capture: Capture) -> tuple[list[str], str | None]:
             )
             if (form := _parity(lines)) is not None:
                 problem += f". As '{form}' they are weights: set 'format: {form}', also in a terminal program"
+        elif all(map(_UNMARKED.fullmatch, lines)):
+            problem += (
+                "They look like lines of a G&G balance, which do not say whether the weight is stable: use a balance "
+                "with one of the protocols in the page on balances"
+            )
         elif len(labels) > 1:
             problem += f"As their letters show, {IN_TURN}, with its unit"
         else:

@@ -356,16 +356,25 @@ def test_lines_without_any_weight_fit_no_dialect(tmp_path, content, said):
     assert "best fit" not in result.stdout
 
 
-GG = b"     0.00 GN\r\n-  450.38 GN\r\n     0.000 g \r\n-  29.182 g \r\n     0.665 g \r\n"
+GG = b"     0.00 GN\r\n-  450.38 GN\r\n    10.30 GN\r\n    0.000 g \r\n-  29.182 g \r\n    0.665 g \r\n"
 KERN = b"        0.000 g  \r\n      -29.186 g  \r\n        0.665 g  \r\n"
 INTERVAL = b"       0.01 g    00:00:00\r\n     176.30 g ? 00:00:15\r\n     192.21 g\r\n     207.80 g TOTAL\r\n"
+
+
+def test_lines_of_a_balance_that_does_not_say_whether_its_weight_is_stable_name_it(tmp_path):
+    """G&G PLC100BC, eamars/OpenTrickler-RP2040-Controller, issue 15; the manual of G&G's JJ-BC, p. 14: 14 bytes."""
+    path = tmp_path / "capture.txt"
+    path.write_bytes(GG)
+    result = explain(path)
+    assert result.exit_code == 1
+    assert "no dialect reads a weight in these lines, such as '     0.00 GN'" in result.stderr
+    assert "They look like lines of a G&G balance, which do not say whether the weight is stable" in result.stderr
 
 
 @pytest.mark.parametrize(
     ("content", "weights", "notes"),
     [
-        # G&G PLC100BC and Kern, eamars/OpenTrickler-RP2040-Controller, issue 15
-        (GG, "0.000 g, 0.665 g", ["1 × invalid: '-  29.182 g ': "]),
+        # Kern, eamars/OpenTrickler-RP2040-Controller, issue 15
         (KERN, "0.000 g, -29.186 g, 0.665 g", []),
         # Ohaus RS232 Interface Manual, p. EN-3: interval printing and a sum
         (INTERVAL, "192.21 g", ["2 × a line of interval printing, not a weight", "1 × a sum ('TOTAL'), not a weight"]),
