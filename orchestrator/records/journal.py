@@ -448,7 +448,7 @@ class Journal(JournalReader):
             )
         raise JournalError(
             f"{self.path}: this run was begun with other settings, and its next steps depend on them: {difference}. "
-            "Set that back to resume it, or begin a new run"
+            "Set that back, use the version that began the run (see versions.json next to it), or begin a new run"
         )
 
 

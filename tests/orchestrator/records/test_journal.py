@@ -205,7 +205,7 @@ def test_a_run_can_not_be_begun_over_another(path: Path) -> None:
 
 def test_other_settings_are_refused_by_name(path: Path) -> None:
     Journal.create(path, HEADER).close()
-    with pytest.raises(JournalError, match=r"deployment\.pours: 3 became 5"):
+    with pytest.raises(JournalError, match=r"deployment\.pours: 3 became 5.* versions\.json next to it"):
         Journal.resume(path, Header("toy", {"seed": 7, "deployment": {"pours": 5}}))
     Journal.resume(path, HEADER).close()  # and the refusal left no lock behind
 
