@@ -140,7 +140,8 @@ class PourProgress:
         stable: whether the balance reports a stable value, if known.
         joints: of the arm as last measured [rad]; empty if the arm does not report them.
         pourer: pose of the pourer in the world (x y z [m], qw qx qy qz), from an arm without joints; else empty.
-        liquid: particles of this pour, reported once by a virtual bench. Hidden from the learning algorithms.
+        liquid: particles of this pour, reported by a virtual bench: once, or in a dose those since the last report.
+            Hidden from the learning algorithms.
         dose: of a wanted amount; None in other pours.
     """
 

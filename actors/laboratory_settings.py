@@ -116,6 +116,9 @@ class BenchSettings(Settings):
     pose_noise: PoseNoise = PoseNoise()
     """Random error of grip and placement, drawn for each pour."""
 
+    doses: Annotated[Literal["formula", "particles"], NOT_IN_FINGERPRINT] = "formula"
+    """Liquid of doses: 'particles' as in other pours; with a 'formula' they take no simulation, out of straight cups only, and never miss the receiver."""  # noqa: E501
+
     balance: BenchBalance = BenchBalance()
     """The balance of a simulated bench; a laboratory with an arm has a separate section for it."""
 
@@ -130,6 +133,15 @@ class BenchSettings(Settings):
     def _from_parameters(cls, value: Any) -> Any:
         """A program may also give the θ itself."""
         return TrueLiquid(**value.of_the_solver()) if isinstance(value, SimulationParameters) else value
+
+    def check_values(self, problems: Problems) -> None:
+        """See `Settings.check_values`."""
+        if self.doses == "particles" and problems.valid("liquid") and self.theta.lip_adhesion > 0.0:
+            text = (
+                "what runs down the outside of the pourer is not simulated in doses: remove 'lip_adhesion', or write "
+                "'doses: formula'"
+            )
+            problems.add(text, "liquid", "lip_adhesion")
 
     @property
     def theta(self) -> SimulationParameters:

@@ -38,6 +38,7 @@ from actors.dosing.particle_liquid import ParticleLiquid
 from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseEnd, InvalidActionError
+from actors.simulators.live_worker import LocalLivePours
 from orchestrator.campaigns.file_loading import load_vessel
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
@@ -157,7 +158,7 @@ def pour_series(name: str, seed: int) -> list[Dose]:
         scene = Scene("dose", spec, row.receiver, poured, mirrored=True)
         theta = SimulationParameters(particles=2 * round(0.5 * row.particles * bench.content / full))
         task = PourTask(scene, action, theta, int(own.integers(2**31)), pose_error=PoseError(x=aside))
-        return ParticleLiquid(bench, simulator, task)
+        return ParticleLiquid(bench, LocalLivePours(simulator), task)
 
     first = water.model_copy(update={"mass": float(rng.uniform(0.4, 0.9)) * full})
     doses: list[Dose] = []

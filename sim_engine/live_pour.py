@@ -11,7 +11,7 @@ Vessels that touch are not found.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,13 +159,33 @@ class LivePour:
         return False
 
     def _start(self, motion: SampledMotion) -> None:
-        from sim_engine.fluid.engine import engine
-
         simulator, task = self._simulator, self._task
         start = calm_until(motion, simulator.vessel(task.scene.pourer), task.scene.liquid.volume)
-        fluid = engine()
+        fluid = simulator.engine()
         fluid.load([simulator.setup(task, motion, start, self._mirrored, LONGEST)])
         self._fluid, self._load, self._slices = fluid, fluid.loads, round(start / LIVE_SLICE)
 
 
-__all__ = ["LIVE_SLICE", "LivePour", "LiveState"]
+class LivePours(Protocol):
+    """One pour after another; `actors.simulators.live_worker` has them in a process of its own."""
+
+    def begin(self, task: PourTask, pose: Floats) -> None:
+        """Begin a pour; see `LivePour`. The one before is over. It is mirrored if its scene and
+        its vessels allow it; the pourer then moves in its plane of symmetry.
+        """
+        ...
+
+    def advance(self, times: Floats, poses: Floats) -> LiveState:
+        """See `LivePour.advance`."""
+        ...
+
+    def particles(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """See `LivePour.particles`."""
+        ...
+
+    def close(self) -> None:
+        """End it. May be called again."""
+        ...
+
+
+__all__ = ["LIVE_SLICE", "LivePour", "LivePours", "LiveState"]

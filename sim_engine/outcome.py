@@ -182,6 +182,15 @@ class RecordedFrames:
     states: list[NDArray[np.uint8]]
     pourer_poses: NDArray[np.float64]
 
+    def joined(self, later: RecordedFrames) -> RecordedFrames:
+        """These frames and later ones of the same pour."""
+        return RecordedFrames(
+            np.concatenate([self.times, later.times]),
+            [*self.positions, *later.positions],
+            [*self.states, *later.states],
+            np.concatenate([self.pourer_poses, later.pourer_poses]),
+        )
+
     def copied(self) -> RecordedFrames:
         """A copy in its own memory."""
         positions, states = [np.array(p) for p in self.positions], [np.array(s) for s in self.states]

@@ -502,14 +502,22 @@ class PourSimulator:
             SimulationCancelled: `cancelled` returned True.
             WrongOutcomeError: the engine gives wrong outcomes on this machine.
         """
+        motion = self.prepare(task)
+        return self._pour(self.engine(), task, motion, cancelled)
+
+    def engine(self) -> FluidEngine:
+        """The engine of this process, checked.
+
+        Raises:
+            WrongOutcomeError: it gives wrong outcomes on this machine.
+        """
         from sim_engine.fluid.engine import engine
 
-        motion = self.prepare(task)
         fluid = engine()
         if not self._checked:
             check_engine(lambda task: self._pour(fluid, task, self.prepare(task), None).outcome)
             self._checked = True
-        return self._pour(fluid, task, motion, cancelled)
+        return fluid
 
     def _pour(
         self, fluid: FluidEngine, task: PourTask, motion: Motion, cancelled: Callable[[], bool] | None

@@ -158,6 +158,7 @@ class PouringBench:
         if self.balance is not None:
             with contextlib.suppress(LaboratoryError):
                 await self.balance.release()
+        await self.ground_truth.close()
         if self._setup.supply is not None:
             await self._setup.supply.close()
         if self._setup.held is not None:

@@ -138,8 +138,7 @@ class DoseProcedure(BenchProcedure):
             await self._consent.given(start_question(setup.spec, self._path))
             self._moves = True
             async with setup.ground_truth.followed():
-                result = await self._out_and_home()
-            truth = await setup.ground_truth.flowed()
+                result, truth = await self._out_and_home()
             if result.amount is None:
                 raise UnknownPourError(unknown_amount(result))
             if setup.doses is not None:
@@ -254,7 +253,8 @@ class DoseProcedure(BenchProcedure):
         while len(self._readings.all) < begin + count and self._now() < end:
             await self._sleep(TICK)
 
-    async def _out_and_home(self) -> DoseResult:
+    async def _out_and_home(self) -> tuple[DoseResult, dict[str, Any]]:
+        """Returns the result of the controller, and the true masses of a virtual bench."""
         setup, path = self._setup, self._path
         self._report.enter("approach")
         try:
@@ -262,7 +262,7 @@ class DoseProcedure(BenchProcedure):
         except STUCK as error:
             await self._consent.bring_home(error, begun=self._begun)
             raise
-        await setup.ground_truth.flows()
+        await setup.ground_truth.flows(self._report.pour if self._report.watched else None)
         if setup.doses is not None:
             setup.doses.begins(self._scene, self._dose)
             self._entered = True
@@ -275,8 +275,9 @@ class DoseProcedure(BenchProcedure):
             await self._upright(error)
             await self._home()
             raise
+        truth = await setup.ground_truth.flowed()
         await self._home()
-        return result
+        return result, truth
 
     async def _upright(self, error: Exception) -> None:
         """After a stop: the cup may have turned back by itself; if it has not, the operator consents to its return."""

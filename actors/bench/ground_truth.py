@@ -72,6 +72,11 @@ def draw_pose_error(spec: BenchSettings, seed: int) -> PoseError:
     )
 
 
+def liquid_seed(seed: int) -> int:
+    """Seed of the liquid of a dose."""
+    return int(np.random.default_rng(stream(seed, "liquid")).integers(2**31))
+
+
 class TouchingError(LaboratoryError):
     """With the hidden errors of grip and placement the vessels would touch."""
 
@@ -271,11 +276,15 @@ class GroundTruth:
         """Whether it is certain that nothing has left the pourer; only an emulated arm can tell."""
         return False
 
-    async def flows(self) -> None:
-        """Called when the arm is about to tilt for a dose: from now on the liquid follows its motion."""
+    async def flows(self, show: Callable[[RecordedFrames], None] | None = None) -> None:
+        """Called when the arm is about to tilt for a dose: from now on the liquid follows its motion.
+
+        Args:
+            show: receives the particles meanwhile, if a live view needs them.
+        """
 
     async def flowed(self) -> dict[str, Any]:
-        """Called after a dose, also after an aborted one. Returns the true amount of a virtual bench."""
+        """Called after a dose, also after an aborted one. Returns the true masses of a virtual bench."""
         return {}
 
     async def lasting(self, doing: Awaitable[T], seconds: float) -> T:
@@ -294,3 +303,6 @@ class GroundTruth:
 
     async def end(self) -> None:
         """Called when the pour is over, in every case."""
+
+    async def close(self) -> None:
+        """Called when the bench is closed."""

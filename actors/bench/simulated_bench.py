@@ -18,7 +18,17 @@ from actors.balance.balance_device import DeviceBalance
 from actors.balance.scale_model import Load
 from actors.balance.simulated_balance import SimulatedBalanceSettings
 from actors.bench.bench_operators import OperatorQuestions
-from actors.bench.ground_truth import GroundTruth, PourAsk, Spill, TouchingError, draw_pose_error, stream, true_spill
+from actors.bench.ground_truth import (
+    GroundTruth,
+    PourAsk,
+    Spill,
+    TouchingError,
+    draw_pose_error,
+    liquid_seed,
+    stream,
+    true_spill,
+)
+from actors.dosing.particle_liquid import check_particles, dose_task
 from actors.dosing.simulated_dose import simulated_dose
 from actors.dosing_settings import DosingSettings
 from actors.interfaces import (
@@ -32,8 +42,10 @@ from actors.interfaces import (
     SimulatorPool,
 )
 from actors.laboratory_settings import BenchSettings
+from actors.simulators.live_worker import LivePourProcess
+from sim_engine.live_pour import LivePours
 from sim_engine.outcome import PourMeasurement
-from sim_engine.scene import Scene
+from sim_engine.scene import PourTask, Scene
 
 CARRYING_TIME = 2.0
 """Bench time to put an object on the balance or to remove it [s]."""
@@ -65,18 +77,31 @@ class SimulatedBench(GroundTruth):
         self._spec, self._simulators, self._arm, self._balance = spec, simulators, arm, balance
         self._pour: PourAsk | None = None
         self._liquid: asyncio.Task[Spill] | None = None
+        self._live = LivePourProcess()
 
     async def simulated_dose(
         self, scene: Scene, dose: DoseTarget, seed: int, dosing: DosingSettings, progress: ProgressCallback | None
     ) -> PourMeasurement | None:
-        """See `GroundTruth.simulated_dose`; the pourer is held as wrongly as in the pour of the same seed."""
-        loop, held = asyncio.get_running_loop(), draw_pose_error(self._spec, seed).tilt
+        """See `GroundTruth.simulated_dose`; the placement is as wrong as in the pour of the same seed."""
+        loop, error = asyncio.get_running_loop(), draw_pose_error(self._spec, seed)
 
         def show(state: PourProgress) -> None:
             if progress is not None:
                 loop.call_soon_threadsafe(progress, state)
 
-        return await asyncio.to_thread(simulated_dose, scene, dose, seed, dosing, held_tilt=held, progress=show)
+        def particles(content: float) -> tuple[PourTask, LivePours]:
+            return dose_task(scene, scene.action({}), content, self._spec.theta, error, liquid_seed(seed)), self._live
+
+        poured = particles if self._spec.doses == "particles" else None
+        if poured is not None:
+            check_particles(scene, dose.amount, self._spec.theta)
+        return await asyncio.to_thread(
+            simulated_dose, scene, dose, seed, dosing, held_tilt=error.tilt, progress=show, particles=poured
+        )
+
+    async def close(self) -> None:
+        """See `GroundTruth.close`."""
+        await asyncio.to_thread(self._live.close)
 
     async def prepare(self, pour: PourAsk) -> None:
         """See `GroundTruth.prepare`; starts the simulation of the liquid."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,20 +23,33 @@ from actors.arm.arm_device import DeviceArm
 from actors.arm.arm_interface import Executed
 from actors.arm.arm_settings import ArmEmulator, ArmSettings, History, arm_kind
 from actors.arm.planned_pour import slipped
+from actors.arm.pour_feasibility import vessel
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceEmulator, BalanceSettings, balance_kind
 from actors.balance.scale_model import Load
 from actors.bench.bench_operators import Hands
-from actors.bench.flowing_liquid import FlowEnd, FlowingLiquid, FlowOrder
-from actors.bench.ground_truth import FASTEST_DOSE, GroundTruth, PourAsk, draw_pose_error, spill_of, stream, true_pour
+from actors.bench.flowing_liquid import FOLLOWED, FlowEnd, FlowingLiquid, FlowOrder, FormulaLiquid
+from actors.bench.ground_truth import (
+    FASTEST_DOSE,
+    GroundTruth,
+    PourAsk,
+    draw_pose_error,
+    liquid_seed,
+    spill_of,
+    stream,
+    true_pour,
+)
 from actors.dosing.dose_series import source_of
+from actors.dosing.particle_liquid import FRAME_INTERVAL, check_particles, dose_task
 from actors.dosing.simulated_dose import true_cup
 from actors.grippers.gripper_interface import GripperEmulator, GripperSettings
-from actors.interfaces import DoseTarget, LaboratoryError, SimulatorPool
+from actors.interfaces import DoseSource, DoseTarget, LaboratoryError, SimulatorPool
 from actors.laboratory_settings import BenchSettings
 from actors.runtime.bench_clock import PATIENCE, DeviceClock, device_clock
 from actors.runtime.remote_object import Device
+from actors.simulators.live_worker import LivePourProcess
 from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import RecordedFrames
 from sim_engine.scene import PoseError, PourTask, SampledMotion, Scene
 
 FloatArray = NDArray[np.float64]
@@ -107,6 +120,7 @@ class BenchEmulators:
         self._weighs = balance
         self._balance: BalanceEmulator | None = None
         self._flow: FlowingLiquid | None = None
+        self._pours = LivePourProcess()
         self._gripper: GripperEmulator | None = None
         try:
             if gripper is not None:
@@ -175,7 +189,12 @@ class BenchEmulators:
         arm = None if self._arm is None else self._arm.true_arm
         if arm is None or self._balance is None:
             raise LaboratoryError("the virtual bench pours wanted amounts with an emulated arm and balance only")
-        self._flow = FlowingLiquid(order, arm, self.history, self._load)
+        self._flow = FlowingLiquid(order, arm, self.history, self._load, self._pours)
+
+    def frames(self) -> RecordedFrames | None:
+        """Frames of the flowing particles since the last call; see `FlowOrder.watched`."""
+        flow = self._flow
+        return None if flow is None else flow.frames()
 
     def flowed(self) -> FlowEnd | None:
         """End the flow. Returns what flowed; None if nothing did."""
@@ -200,7 +219,9 @@ class BenchEmulators:
 
     def close(self) -> None:
         """End both emulators. May be called again."""
-        self.flowed()
+        with contextlib.suppress(LaboratoryError):
+            self.flowed()
+        self._pours.close()
         if self._arm is not None:
             self._arm.close()
         if self._balance is not None:
@@ -271,6 +292,11 @@ class DeviceEmulators:
     async def flow(self, order: FlowOrder) -> None:
         """Let liquid follow the arm."""
         await self.device.call("flow", order, deadline=DEADLINE)
+
+    async def frames(self) -> RecordedFrames | None:
+        """Frames of the flowing particles since the last call."""
+        frames: RecordedFrames | None = await self.device.call("frames", deadline=DEADLINE, urgent=True)
+        return frames
 
     async def flowed(self) -> FlowEnd:
         """End the flow. Returns what flowed."""
@@ -480,8 +506,9 @@ class FollowedBench(VirtualBench):
         self._joints: list[tuple[float, ...]] = []
         self._since = self._earlier = 0.0
         self._gap = ""
-        self._flow: FlowOrder | None = None
+        self._dose: tuple[Scene, DoseSource, int] | None = None  # with the seed
         self._flowing = False
+        self._showing: asyncio.Task[None] | None = None
 
     @contextlib.asynccontextmanager
     async def followed(self) -> AsyncIterator[None]:
@@ -514,13 +541,13 @@ class FollowedBench(VirtualBench):
         ):
             mass = None if spec.grip is None else spec.grip.mass
             contents.dry.setdefault(name, contents.dry[usual] if mass is None else mass)
-        cup, rng = true_cup(scene), np.random.default_rng((seed, 51))
-        held = source.mass + source.deviation * float(rng.standard_normal())
+        if self._spec.doses == "particles":
+            check_particles(scene, dose.amount, self._spec.theta)
+        volume = vessel(scene.pourer).capacity if self._spec.doses == "particles" else true_cup(scene).capacity
+        held = source.mass + source.deviation * float(np.random.default_rng((seed, 51)).standard_normal())
         if carried is None and (source.fill or self.contents.in_pourer <= 0.0):
-            self.contents.in_pourer = min(max(held, 1e-3), 0.99 * cup.capacity * scene.liquid.density)
-        wetness = 0.0 if source.unused else 0.2 if source.fill else 0.7
-        held_tilt = draw_pose_error(self._spec, seed).tilt
-        self._flow = FlowOrder(cup, scene.liquid, source.constants, seed, wetness, 0.0, held_tilt)
+            self.contents.in_pourer = min(max(held, 1e-3), 0.99 * volume * scene.liquid.density)
+        self._dose = scene, source, seed
         self._hands.prepare(source.mass if carried else contents.in_pourer, stream(seed, "arm"))
         await self.emulators.prepare(stream(seed, "balance"))
         await self.emulators.put(self.contents.carried)
@@ -552,24 +579,45 @@ class FollowedBench(VirtualBench):
             return not self._left
         return False
 
-    async def flows(self) -> None:
+    async def flows(self, show: Callable[[RecordedFrames], None] | None = None) -> None:
         """See `GroundTruth.flows`."""
-        assert self._flow is not None
-        liquid = self._flow.liquid.model_copy(update={"mass": self.contents.in_pourer})
-        order = replace(self._flow, liquid=liquid, base=self.contents.carried)
-        await self.emulators.flow(order)
+        assert self._dose is not None
+        scene, source, seed = self._dose
+        error, content = draw_pose_error(self._spec, seed), self.contents.in_pourer
+        liquid: FormulaLiquid | PourTask
+        if self._spec.doses == "particles":
+            liquid = dose_task(scene, FOLLOWED, content, self._spec.theta, error, liquid_seed(seed))
+        else:
+            wetness = 0.0 if source.unused else 0.2 if source.fill else 0.7
+            filled = scene.liquid.model_copy(update={"mass": content})
+            liquid = FormulaLiquid(true_cup(scene), filled, source.constants, seed, wetness)
+        on_tray = "tray" in self.contents.on_balance
+        watched = show is not None and isinstance(liquid, PourTask)
+        await self.emulators.flow(FlowOrder(liquid, self.contents.carried, error.tilt, on_tray, watched))
         self._flowing = True
+        if show is not None and watched:
+            self._showing = asyncio.create_task(self._show(show))
+
+    async def _show(self, show: Callable[[RecordedFrames], None]) -> None:
+        while True:
+            await asyncio.sleep(FRAME_INTERVAL)
+            with contextlib.suppress(LaboratoryError):
+                if (frames := await self.emulators.frames()) is not None:
+                    show(frames)
 
     async def flowed(self) -> dict[str, Any]:
         """See `GroundTruth.flowed`."""
         if not self._flowing:
             return {}
         self._flowing = False
+        if self._showing is not None:
+            self._showing.cancel()
+            await asyncio.gather(self._showing, return_exceptions=True)
         self._left = True  # unless the emulators report otherwise
         end = await self.emulators.flowed()
         self._left = end.received + end.spilled > 0.0
         self.contents.receive(end.spilled, end.left)
-        return {"true": end.received, "upright": end.upright}
+        return {"true": end.received, "true_spilled": end.spilled, "upright": end.upright}
 
     async def note(self) -> None:
         """Read the arm's motion since the last call.

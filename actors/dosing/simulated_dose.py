@@ -3,13 +3,13 @@
 The same target and seed give the same dose, whatever was poured before: content and knowledge of the source are part of
 the target.
 
-Limitations: straight cups only, because the virtual bench has no other.
+Limitations: without particles straight cups only.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ import numpy as np
 from actors.dosing.dose_controller import DoseController, DoseOrder, DosePhase, DoseResult
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, after_dose, check_dose, series_of, source_of, unknown_amount
+from actors.dosing.particle_liquid import ParticleLiquid
 from actors.dosing.tilt_command import TiltCommand
 from actors.dosing.virtual_dosing_bench import DoseRecord, TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
@@ -27,9 +28,10 @@ from actors.interfaces import (
     ProgressCallback,
     UnknownPourError,
 )
-from sim_engine.outcome import PourMeasurement
-from sim_engine.scene import Scene
-from sim_engine.vessel.vessel import build_vessel
+from sim_engine.live_pour import LivePours
+from sim_engine.outcome import PourMeasurement, RecordedFrames
+from sim_engine.scene import PourTask, Scene
+from sim_engine.vessel.vessel import Vessel, build_vessel
 
 STRAIGHT = 0.03
 """Largest relative difference between a cup's capacity and that of the cylinder of its opening."""
@@ -52,6 +54,7 @@ def simulated_dose(
     *,
     held_tilt: float = 0.0,
     progress: ProgressCallback | None = None,
+    particles: Callable[[float], tuple[PourTask, LivePours]] | None = None,
 ) -> PourMeasurement:
     """Pour a wanted amount out of the scene's pourer.
 
@@ -62,14 +65,19 @@ def simulated_dose(
         settings: of the dose.
         held_tilt: by which the pourer is held more tilted than commanded [rad].
         progress: receives the progress, as fast as the dose is computed.
+        particles: returns the pour of particles out of a source with this content [kg], and what simulates it; None:
+            the bench's formula.
 
     Raises:
-        InvalidActionError: see `check_dose` and `check_straight`.
+        InvalidActionError: see `check_dose`, and without particles `check_straight`.
+        LaboratoryError: the particles could not be simulated.
         UnknownPourError: the amount in the receiver is not known at the end.
     """
     check_dose(scene, dose)
-    check_straight(scene)
-    series, bench, placed = _set_up(scene, dose, seed, settings, held_tilt)
+    if particles is None:
+        check_straight(scene)
+    poured = None if particles is None else _poured(particles, progress)
+    series, bench, placed = _set_up(scene, dose, seed, settings, held_tilt, poured)
     loaded = bench.content
     controller = series.controller(DoseOrder(dose.amount, dose.limit, receiver_mass=bench.receiver_mass), seed=seed)
     record = bench.dose(controller if progress is None else _Shown(controller, progress))
@@ -81,6 +89,22 @@ def simulated_dose(
     retained = max(loaded - record.spilled - result.amount, 0.0)  # the receiver was weighed, the source was not
     notes = _notes(dose, result, record, bench, series, placed)
     return PourMeasurement(loaded, record.spilled, retained, {"dose": notes})
+
+
+def _poured(
+    particles: Callable[[float], tuple[PourTask, LivePours]], progress: ProgressCallback | None
+) -> Callable[[VirtualDosingBench], ParticleLiquid]:
+    """Makes the liquid of a dose of particles, whose frames are reported."""
+
+    def show(frames: RecordedFrames) -> None:
+        if progress is not None:
+            progress(PourProgress("dose", 0.0, liquid=frames))
+
+    def liquid(bench: VirtualDosingBench) -> ParticleLiquid:
+        task, pours = particles(bench.content)
+        return ParticleLiquid(bench, pours, task, None if progress is None else show)
+
+    return liquid
 
 
 class _Shown:
@@ -107,7 +131,12 @@ class _Shown:
 
 
 def _set_up(
-    scene: Scene, dose: DoseTarget, seed: int, settings: DosingSettings, held_tilt: float
+    scene: Scene,
+    dose: DoseTarget,
+    seed: int,
+    settings: DosingSettings,
+    held_tilt: float,
+    poured: Callable[[VirtualDosingBench], ParticleLiquid] | None,
 ) -> tuple[DoseSeries, VirtualDosingBench, tuple[DoseReading, ...]]:
     source = source_of(scene, dose)
     constants = seed if dose.source is None else source.constants
@@ -125,13 +154,14 @@ def _set_up(
     )
     wetness = 0.0 if source.unused else 0.2 if source.fill else 0.7
     bench = VirtualDosingBench(
-        true_cup(scene),
+        _cup(pourer),
         liquid,
         scale,
         constants,
         dose_seed=None if dose.source is None else seed,
         wetness=wetness,
         held_tilt=held_tilt,
+        poured=poured,
     )
     placed = bench.place_receiver()
     return series_of(scene, dose, settings, placed, rng, step=scale.step), bench, placed
@@ -153,13 +183,16 @@ def true_cup(scene: Scene) -> TrueCup:
         InvalidActionError: the vessel is no straight cup.
     """
     vessel = build_vessel(scene.pourer)
-    height = vessel.rim_height - vessel.inner_floor
-    cup = TrueCup(vessel.opening_radius, height)
+    cup = _cup(vessel)
     if not math.isclose(cup.capacity, vessel.capacity, rel_tol=STRAIGHT):
         raise InvalidActionError(
             f"{vessel.name} is no straight cup; virtual benches pour wanted amounts out of straight cups only"
         )
     return cup
+
+
+def _cup(vessel: Vessel) -> TrueCup:
+    return TrueCup(vessel.opening_radius, vessel.rim_height - vessel.inner_floor)
 
 
 def _notes(

@@ -24,7 +24,7 @@ from actors.arm.pour_feasibility import path_of
 from actors.arm.pour_feasibility import vessel as built
 from actors.grippers.gripper_interface import GripperSettings
 from actors.interfaces import DoseTarget, InvalidActionError, LaboratoryError, UnreachablePlaceError
-from actors.laboratory_settings import LaboratorySettings
+from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from actors.places import CellVessel, PlaceSettings, all_places
 from orchestrator.campaigns.yaml.file_access import why_not_writable
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
@@ -33,7 +33,7 @@ from orchestrator.learning.calibration.action_prior import actions_all_over
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan, DispensePlan
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.collision import contact_during, describe_contact
-from sim_engine.hydrostatics import level
+from sim_engine.hydrostatics import level, retained_volume
 from sim_engine.lip_flow import flow_course
 from sim_engine.motion import plan_motion
 from sim_engine.scene import MIRRORED_FROM, Scene
@@ -475,7 +475,7 @@ class _Checker:
         if problem is not None:
             self.add(role.places(("motion",)), f"{role.text}: {problem}")
 
-    def doses(self, plan: DispensePlan, *, simulated: bool) -> None:
+    def doses(self, plan: DispensePlan, laboratory: LaboratorySettings) -> None:
         """Every dose must fit into its receiver and come out of a full source."""
         section = dose_section(plan)
         for scene in plan.scenes:
@@ -489,14 +489,9 @@ class _Checker:
                 continue
             if missed := _misses(DOSE_TILTS, scene, *vessels, self.landings):
                 self.add(role.places(*missed[0]), f"{role.text}: {missed[1]}")
-            if simulated:
-                from actors.dosing.simulated_dose import check_straight
-
-                try:
-                    check_straight(scene)
-                except InvalidActionError as error:
-                    self.add(role.places(("sources",), ("pourer",)), f"{role.text}: {error}")
-            elif self.arm is not None:
+            smallest = min((planned.amount for planned in doses), default=math.inf)
+            self._dosable(scene, vessels[0], (smallest, largest), role, laboratory.bench)
+            if self.arm is not None:
                 if not arm_kind(self.arm).doses:
                     self.add(role.places(), f"an arm of the kind '{self.arm.kind}' can't pour wanted amounts")
                     continue
@@ -514,6 +509,32 @@ class _Checker:
                     f"{1e3 * (dose.amount + dose.limit + plan.refill_below):g} g"
                 )
                 self.add((("dispense", "doses", i, "amount"), ("dispense", "doses")), text)
+
+    def _dosable(
+        self, scene: Scene, pourer: Vessel, amounts: tuple[float, float], role: _Role, bench: BenchSettings | None
+    ) -> None:
+        """Whether doses [kg] from the smallest to the largest one can be poured out of a full source."""
+        from actors.dosing.cup_flow import LARGEST_TILT
+        from actors.dosing.particle_liquid import check_particles
+        from actors.dosing.simulated_dose import check_straight
+
+        source = role.places(("sources",), ("pourer",))
+        kept = scene.liquid.density * retained_volume(pourer, LARGEST_TILT)
+        if scene.liquid.mass - kept < amounts[1]:
+            self.add(
+                source,
+                f"{role.text}: '{pourer.name}' keeps {1e3 * kept:.4g} g of {1e3 * scene.liquid.mass:.4g} g when it is "
+                f"tilted by {math.degrees(LARGEST_TILT):.0f} deg; a dose with its tolerance takes up to "
+                f"{1e3 * amounts[1]:.4g} g: fill it with more, or use a vessel with a wider opening",
+            )
+        try:
+            if bench is not None and bench.doses == "particles":
+                source = role.places(("doses",))
+                check_particles(scene, amounts[0], bench.theta)
+            elif bench is not None:
+                check_straight(scene)
+        except InvalidActionError as error:
+            self.add(source, f"{role.text}: {error}")
 
     def display(self, plan: DispensePlan, laboratory: LaboratorySettings) -> None:
         """The balance must be fast enough for the tolerance of every dose, as far as its settings state it."""
@@ -687,7 +708,7 @@ def _check_doses(plan: CampaignPlan, dispense: DispensePlan, checker: _Checker, 
         )
         checker.add((dose_section(dispense), ("laboratory",)), text)
     before = len(checker.problems)
-    checker.doses(dispense, simulated=laboratory.arm is None)
+    checker.doses(dispense, laboratory)
     checker.display(dispense, laboratory)
     if dispense.mixtures is not None and len(checker.problems) == before:
         checker.mixtures(plan, tell)

@@ -62,6 +62,8 @@ class CellScene:
         self._trail: list[list[float]] = []
         self._moves: list[tuple[Moment, tuple[float, ...]]] = []
         self._liquid: RecordedFrames | None = None
+        self._dosed: float | None = None  # radius of a dose's particles [m]
+        self._particles = None if laboratory.bench is None else laboratory.bench.theta.particles
         self._stands: tuple[float, ...] = ()
         sink.log(PLACE, shapes.fates(), static=True)  # on the parent, since clearing the liquid would remove it
         sink.log(f"{PLACE}/tool", rr.TransformAxes3D(0.06), static=True)
@@ -105,7 +107,9 @@ class CellScene:
     def begin(self, pour: Pour, scene: Scene) -> None:
         """Start a pour: show its vessels and its planned path."""
         self.show()
-        self._trail, self._liquid = [], None
+        self._trail, self._liquid, self._dosed = [], None, None
+        if pour.dose is not None and self._particles is not None:
+            self._dosed = 0.5 * (scene.liquid.volume / self._particles) ** (1.0 / 3.0)
         self._stand("pourer", scene.pourer)
         self._stand("receiver", scene.receiver)
         self._sink.clear(f"{PLACE}/liquid")
@@ -119,7 +123,9 @@ class CellScene:
 
     def progress(self, told: PourProgress) -> None:
         """Process progress of a pour: the arm's pose and the liquid."""
-        if told.liquid is not None:
+        if told.liquid is not None and self._dosed is not None:
+            self._flow(told.liquid, self._dosed)
+        elif told.liquid is not None:
             self._liquid = told.liquid
         if self.time_scale > SLOW and self._films.next_due is not None:
             return  # playback of the previous pour is shown
@@ -131,6 +137,14 @@ class CellScene:
         elif told.pourer:
             self._sink.log(f"{PLACE}/pourer", shapes.placed(np.array(told.pourer)))
             self._follow(told.pourer[:3], self._sink.now)
+
+    def _flow(self, liquid: RecordedFrames, radius: float) -> None:
+        """Show the particles of a dose at once, or keep them for its playback."""
+        if self.time_scale <= SLOW:
+            shown = shapes.swarms(liquid.positions[-1:], liquid.states[-1:], radius)
+            self._sink.rows(f"{PLACE}/liquid", [self._sink.now], shown)
+        else:
+            self._liquid = liquid if self._liquid is None else self._liquid.joined(liquid)
 
     def show(self) -> None:
         """Log the arm's motion since the last call. Several poses are computed and sent at the cost of one."""
@@ -188,7 +202,8 @@ class CellScene:
         tracks = [] if moves is None else self._moved(times, *moves)
         spilled = None
         if liquid is not None:
-            shown, share = self._poured(times, liquid, scene.liquid.volume, posed=moves is None)
+            radius = self._dosed or 0.5 * shapes.spacing(liquid.positions[0], scene.liquid.volume)
+            shown, share = self._poured(times, liquid, radius, posed=moves is None)
             tracks, spilled = [*tracks, *shown], share * measured.loaded
         tracks += beside(times, spilled)
 
@@ -221,10 +236,9 @@ class CellScene:
         ]
 
     def _poured(
-        self, times: FloatArray, liquid: RecordedFrames, volume: float, *, posed: bool
+        self, times: FloatArray, liquid: RecordedFrames, radius: float, *, posed: bool
     ) -> tuple[list[Track], FloatArray]:
         """Return the liquid's tracks at times (T,) [s], and the fraction of liquid spilled by then, shape (T,)."""
-        radius = 0.5 * shapes.spacing(liquid.positions[0], volume)
         stamps = np.asarray(liquid.times, dtype=float)
         at = np.clip(np.searchsorted(stamps, times + 1e-6, side="left") - 1, 0, len(stamps) - 1)
         some = shapes.changes(at[:, None].astype(float))  # the liquid may be recorded less often, or for a shorter time

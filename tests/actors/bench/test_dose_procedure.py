@@ -29,7 +29,7 @@ from actors.arm.ur_settings import UrArmSettings
 from actors.balance.balance_settings import SerialBalanceSettings
 from actors.bench.virtual_bench import BenchEmulators
 from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, PourProgress, UnknownPourError
-from actors.laboratory_settings import LaboratorySettings
+from actors.laboratory_settings import LaboratorySettings, TrueLiquid
 from actors.liquid_devices import SimulatedPumpSettings, SourceSettings
 from actors.runtime.child_process import child_environment
 from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
@@ -42,7 +42,7 @@ from orchestrator.runs.run_service import RunResources, RunService
 from orchestrator.runs.run_tasks import run_task
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid
-from sim_engine.outcome import PourMeasurement
+from sim_engine.outcome import ParticleState, PourMeasurement
 from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import cylinder
 from tests.support import mixtures
@@ -135,6 +135,33 @@ async def test_a_short_series_is_poured_over_the_wires(open_stage: OpenStage) ->
     assert [dose.filled for dose in poured] == [True, False]
     received = math.fsum(dose.received_g or 0.0 for dose in poured)
     assert poured[-1].left_g == pytest.approx(350.0 - received, abs=5.0)
+
+
+@pytest.mark.slow
+async def test_particles_are_poured_over_the_wires_and_the_source_keeps_the_rest(open_stage: OpenStage) -> None:
+    spec = dosing_spec()
+    assert spec.bench is not None
+    particles = TrueLiquid(particles=1000)  # 0.35 g each
+    spec = spec.with_values(bench=spec.bench.with_values(doses="particles", liquid=particles))
+    seen: list[PourProgress] = []
+    left, on_tray = 0.35, 0.0
+    async with open_stage(spec) as stage:
+        for grams, fill in ((60.0, True), (40.0, False)):
+            source = DoseSource("beaker", left, 5e-4, fill=fill, constants=11)
+            dose = DoseTarget(1e-3 * grams, 1e-3, "A1", source)
+            measured = await stage.bench.pour(SCENE, ACTION, seed=5, dose=dose, progress=seen.append)
+            check_amount(stage, measured, grams, left)
+            about = measured.notes["dose"]
+            taken, spilled = about["true"] + about["true_spilled"], about["true_spilled"]
+            if not fill:
+                assert stage.contents.in_pourer == pytest.approx(left - taken, abs=1e-3)  # no more than escapes
+                assert stage.contents.on_tray == pytest.approx(on_tray + spilled, abs=1e-6)
+            left, on_tray = stage.contents.in_pourer, stage.contents.on_tray
+        with pytest.raises(InvalidActionError, match=r"a dose of 9 g is 25.7 particles .* to 1200 or more"):
+            await dosed(stage, 9.0)
+    frames = [state.liquid for state in seen if state.liquid is not None]
+    assert len(frames) > 50
+    assert max((frame.states[-1] == ParticleState.RECEIVED).mean() for frame in frames) > 0.1
 
 
 @pytest.mark.slow

@@ -1,20 +1,29 @@
 """`flowing_liquid`: liquid that follows an emulated arm: a lost answer is made up for; an emulator that has ended
-ends the flow.
+ends the flow. Particles are simulated while they may move.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from actors.arm.ur_settings import UrArmSettings
 from actors.bench import flowing_liquid
-from actors.bench.flowing_liquid import FlowingLiquid, FlowOrder
+from actors.bench.flowing_liquid import FOLLOWED, FlowingLiquid, FlowOrder, FormulaLiquid
+from actors.dosing.particle_liquid import CALM, ParticleFlow
 from actors.dosing.virtual_dosing_bench import TrueCup
 from actors.interfaces import LaboratoryError
-from sim_engine.liquids import Liquid
+from actors.simulators.live_worker import LivePourProcess
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.live_pour import LiveState
+from sim_engine.scene import PourTask, SampledMotion, Scene
+from sim_engine.vessel.shapes import cylinder
 from tests.support.waiting import PATIENCE
 
 
@@ -26,8 +35,9 @@ class Motion:
 
 
 def following(history: object) -> FlowingLiquid:
-    order = FlowOrder(TrueCup(0.04, 0.1), Liquid(mass=0.3), constants=1, seed=2, wetness=0.0, base=0.1)
-    return FlowingLiquid(order, UrArmSettings.model_construct(), history, lambda mass: None)  # type: ignore[arg-type]
+    liquid = FormulaLiquid(TrueCup(0.04, 0.1), Liquid(mass=0.3), constants=1, seed=2, wetness=0.0)
+    arm, pours = UrArmSettings.model_construct(), LivePourProcess()
+    return FlowingLiquid(FlowOrder(liquid, base=0.1), arm, history, lambda mass: None, pours)  # type: ignore[arg-type]
 
 
 def test_the_flow_ends_when_the_emulator_has_been_silent_for_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,3 +72,126 @@ def test_the_flow_goes_on_after_a_lost_answer() -> None:
     liquid = following(history)
     assert again.wait(PATIENCE)
     liquid.end()
+
+
+BEAKER = cylinder("beaker", inner_radius=0.04, inner_height=0.1)
+DOSE = PourTask(Scene("dose", BEAKER, BEAKER, Liquid(mass=0.3)), FOLLOWED, SimulationParameters(), 1)
+UPRIGHT = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0])
+TILTED = np.array([0.0, 0.0, 0.2, math.cos(0.5), 0.0, math.sin(0.5), 0.0])
+
+
+@dataclass
+class Drips:
+    """Particles of 10 g: while the cup is tilted one leaves it in each step, falls in the next one, and then lies in
+    the receiver and on the tray in turns."""
+
+    left: float = 0.3
+    falls: float = 0.0
+    landed: list[float] = field(default_factory=list)
+    moments: list[float] = field(default_factory=list)
+    invalid: str | None = None
+    hangs: float = 0.0
+
+    def begin(self, task: PourTask, pose: NDArray[np.float64]) -> None:
+        self.left = task.scene.liquid.mass
+
+    def advance(self, times: NDArray[np.float64], poses: NDArray[np.float64]) -> LiveState:
+        assert (np.diff([*self.moments[-1:], *times]) > 0.0).all()
+        self.moments += list(times)
+        self.landed += [self.falls] if self.falls else []
+        self.falls = 0.01 if poses[-1, 5] > 0.1 else 0.0
+        self.left -= self.falls
+        received, spilled = sum(self.landed[::2]), sum(self.landed[1::2])
+        left, falls = self.left - self.hangs, self.falls + self.hangs
+        return LiveState(self.moments[-1], left, falls, received, spilled, self.invalid)
+
+    def particles(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        return np.zeros((3, 3), np.float32), np.zeros(3, np.uint8)
+
+    def close(self) -> None:
+        pass
+
+
+def particles(drips: Drips, *, watched: bool = False) -> ParticleFlow:
+    return ParticleFlow(DOSE, drips, UPRIGHT, watched=watched)
+
+
+def stand(flow: ParticleFlow, begin: float, end: float, pose: NDArray[np.float64]) -> float:
+    """Stand in a pose, in steps of 0.1 s. Returns the mass in the receiver."""
+    load = 0.0
+    for time in np.arange(begin + 0.1, end + 0.05, 0.1):
+        load = flow.follow(np.array([time - 0.05, time]), np.array([pose, pose]))
+    return load
+
+
+def test_what_misses_the_receiver_is_spilled_and_the_rest_stays_in_the_source() -> None:
+    flow = particles(Drips())
+    assert stand(flow, 0.0, 0.5, TILTED) == pytest.approx(0.02)
+    stand(flow, 0.5, 0.6, UPRIGHT)
+    flow.land()
+    assert (flow.received, flow.spilled, flow.left) == pytest.approx((0.03, 0.02, 0.25))
+
+
+def test_a_cup_that_stands_still_is_not_simulated_until_it_moves() -> None:
+    drips = Drips()
+    flow = particles(drips)
+    stand(flow, 0.0, 20.0, UPRIGHT)
+    waited = drips.moments[-1]
+    assert waited == pytest.approx(CALM, abs=0.11)
+    stand(flow, 20.0, 20.5, TILTED)
+    stand(flow, 20.5, 40.0, UPRIGHT)
+    # a while after the last drop has landed time passes, also without motion
+    assert drips.moments[-1] == pytest.approx(waited + 0.5 + CALM, abs=0.25)
+    assert flow.received + flow.spilled + flow.left == pytest.approx(0.3)
+
+
+def test_a_drop_that_hangs_at_a_rim_needs_no_simulation_and_is_left() -> None:
+    drips = Drips(hangs=0.01)
+    flow = particles(drips)
+    stand(flow, 0.0, 20.0, UPRIGHT)
+    assert drips.moments[-1] < 3.0 * CALM
+    flow.land()
+    assert (flow.received, flow.spilled, flow.left) == pytest.approx((0.0, 0.0, 0.3))
+
+
+def test_a_cup_that_stands_tilted_and_pours_is_simulated() -> None:
+    drips = Drips()
+    stand(particles(drips), 0.0, 5.0, TILTED)
+    assert drips.moments[-1] == pytest.approx(5.0)
+
+
+def test_frames_for_a_live_view_are_kept_with_the_time_of_the_dose() -> None:
+    flow = particles(Drips(), watched=True)
+    stand(flow, 0.0, 3.0, UPRIGHT)
+    frames = flow.frames()
+    assert frames is not None
+    assert frames.times[-1] == pytest.approx(3.0)
+    assert len(frames.times) > 10
+    assert flow.frames() is None
+    unwatched = particles(Drips())
+    stand(unwatched, 0.0, 3.0, UPRIGHT)
+    assert unwatched.frames() is None
+
+
+def test_a_simulation_that_fails_ends_the_flow_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Kind:
+        def figure(self) -> object:
+            return self
+
+        def pourer_motion(self, joints: object, times: NDArray[np.float64], grip_tilt: float) -> SampledMotion:
+            return SampledMotion(times, np.array([TILTED] * len(times)))
+
+    monkeypatch.setattr(flowing_liquid, "arm_kind", lambda spec: Kind())
+    clock = itertools.count(1.0, 0.1)
+
+    def history(since: float) -> Motion:
+        now = next(clock)
+        return Motion((now,), ((0.0,) * 6,), now)
+
+    order = FlowOrder(DOSE, base=0.1)
+    arm = UrArmSettings.model_construct()
+    liquid = FlowingLiquid(order, arm, history, lambda mass: None, Drips(invalid="particles crossed vessel walls"))
+    liquid._thread.join(PATIENCE)
+    assert not liquid._thread.is_alive()
+    with pytest.raises(LaboratoryError, match="could not be simulated: particles crossed vessel walls"):
+        liquid.end()

@@ -14,6 +14,7 @@ from actors.dosing.particle_liquid import ParticleLiquid
 from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseEnd
+from actors.simulators.live_worker import LocalLivePours
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PoseError, PourTask, Scene
@@ -40,7 +41,7 @@ def benches(simulator: PourSimulator, aside: float = 0.0) -> tuple[VirtualDosing
         poured = Liquid(mass=bench.content)
         theta = SimulationParameters(particles=round(300 * bench.content / 0.3))
         task = PourTask(Scene("dose", BEAKER, BOWL, poured), ACTION, theta, 1, pose_error=PoseError(x=aside))
-        return ParticleLiquid(bench, simulator, task)
+        return ParticleLiquid(bench, LocalLivePours(simulator), task)
 
     bench = VirtualDosingBench(TrueCup(0.04, 0.1), Liquid(mass=0.3), TrueScale(lag=0.2), 3, poured=liquid)
     flow, rng = CupFlow(simulator.vessel(BEAKER), Liquid(mass=0.1)), np.random.default_rng(3)

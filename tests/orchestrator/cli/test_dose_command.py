@@ -125,6 +125,31 @@ def test_a_balance_that_is_too_slow_for_the_tolerance_is_refused_before_anything
     assert (checked.output.count("is too slow"), "dispense.doses[0]" in checked.output) == (1, True)
 
 
+@pytest.mark.parametrize(
+    ("bench", "inner", "text"),
+    [
+        ("doses: particles, liquid: {particles: 400}", "[35, 0], [35, 60], [12, 70]", ""),
+        ("doses: formula, liquid: {particles: 400}", "[35, 0], [35, 60], [12, 70]", "no straight cup"),
+        ("doses: particles, liquid: {particles: 400}", "[45, 0], [45, 40], [5, 41], [5, 45]", "keeps 60.57 g of 80 g"),
+        ("doses: particles, liquid: {particles: 400, lip_adhesion: 1}", "", "runs down the outside of the pourer"),
+        ("doses: particles, liquid: {particles: 200}", "", "a dose of 8 g is 20.0 particles of the bench's liquid"),
+    ],
+)
+def test_doses_that_the_bench_cannot_pour_are_refused_before_anything_starts(
+    campaign: Path, bench: str, inner: str, text: str
+) -> None:
+    amounts = small_campaign.series(8 if "particles: 200" in bench else 12, 20).replace("mass: 100 g", "mass: 80 g")
+    laboratory = f"laboratory: {{name: small, bench: {{{bench}, time_scale: 0}}}}"
+    path = small_campaign.write_campaign(campaign.parent, re.sub("laboratory: .*", laboratory, amounts))
+    if inner:
+        shape = f"name: flask\nprofile: {{unit: mm, inner: [[0, 0], {inner}], wall: 4 mm, floor: 4 mm}}\n"
+        (campaign.parent / "beaker.yaml").write_text(shape, encoding="utf-8")
+    checked = decant("validate", str(path))
+    assert (checked.exit_code, text in checked.output) == (2 if text else 0, True), checked.output
+    assert not text or decant("run", str(path)).exit_code == 2
+    assert not Path("runs").exists()
+
+
 def test_an_amount_is_needed(campaign: Path) -> None:
     result = decant("dose", str(campaign))
     assert result.exit_code == 2

@@ -36,7 +36,7 @@ from orchestrator.records.events import (
 )
 from orchestrator.runs.run_service import RunResources, RunService
 from orchestrator.runs.run_tasks import run_task
-from sim_engine.outcome import PourMeasurement
+from sim_engine.outcome import ParticleState, PourMeasurement, RecordedFrames
 from sim_engine.vessel.vessel import build_vessel
 from tests.orchestrator.reports.test_mixture_report import MIXTURES
 from tests.support.rerun_recordings import Contents, timeline, views
@@ -155,6 +155,37 @@ def test_the_tab_dosing_shows_entities_that_the_recording_of_a_dose_has(tmp_path
         for entity in entities:
             there = [one for one in recorded.columns if f"{one}/".startswith(f"{entity.removesuffix('/**')}/")]
             assert there if entity.endswith("/**") else entity in there, f"'{name}' shows {entity}, not recorded"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("time_scale", [1.0, 30.0])
+def test_the_particles_of_a_dose_are_shown_live_or_in_a_playback(tmp_path: Path, time_scale: float) -> None:
+    plan, events, _ = dose_events(tmp_path)
+    assert plan.laboratory.bench is not None
+    bench = plan.laboratory.bench.with_values(time_scale=time_scale)
+    plan = replace(plan, laboratory=plan.laboratory.with_values(bench=bench))
+
+    def frame(time: float) -> RecordedFrames:
+        fate = int(ParticleState.RECEIVED if time > 2.0 else ParticleState.IN_POURER)
+        places = np.full((5, 3), 0.01 * time, np.float32)
+        return RecordedFrames(np.array([time]), [places], [np.full(5, fate, np.uint8)], np.eye(1, 7, 3))
+
+    begin = events[2].time
+    flows: list[Event] = [
+        PourProgressed(
+            stage="doses", id=1, number=1, progress=PourProgress("dose", 0.5, liquid=frame(at)), time=begin + at
+        )
+        for at in np.arange(0.1, 4.0, 0.1)
+    ]
+    path = tmp_path / "dose.rrd"
+    monitor = RerunMonitor(path, plan)
+    for event in [*events[:3], *flows, *events[-2:]]:
+        monitor(event)
+    assert monitor.close(timeout=PATIENCE)
+    assert (monitor.failed, monitor.dropped) == (0, 0)
+    fates = Contents(path).values("/cell/liquid", "Points3D:class_ids")
+    assert len(fates) >= 39
+    assert {int(np.asarray(each)[0]) for each in fates} == {int(ParticleState.IN_POURER), int(ParticleState.RECEIVED)}
 
 
 @pytest.mark.slow
