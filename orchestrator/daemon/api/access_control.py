@@ -188,6 +188,8 @@ async def refused(request: Request, error: Exception) -> Response:
     """
     assert isinstance(error, AnyHTTPException)
     text = str(error.detail).encode("utf-8", "backslashreplace").decode("utf-8")
+    if isinstance(error.__cause__, UnicodeDecodeError):
+        text = "the body is not text in UTF-8; send JSON in UTF-8, not compressed"
     if is_stop(request.scope):
         text = not_stopped("a stop is sent with POST" if error.status_code == 405 else text)
     return await http_exception_handler(request, HTTPException(error.status_code, text, dict(error.headers or {})))
@@ -196,13 +198,23 @@ async def refused(request: Request, error: Exception) -> Response:
 async def invalid(request: Request, error: Exception) -> Response:
     """Answer with the problems of a request and their places, and with nothing that was sent."""
     assert isinstance(error, RequestValidationError)
-    problems = [{"type": e["type"], "loc": e["loc"], "msg": e["msg"]} for e in error.errors()]
+    problems = [{"type": e["type"], "loc": e["loc"], "msg": _message(e)} for e in error.errors()]
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if any(e["loc"] == ("body",) for e in problems) and not re.fullmatch(r"application/(.+\+)?json", media_type):
         text = "the body is not read as JSON; send application/json: 'Content-Type: application/json'"
         return JSONResponse({"detail": text}, 422)
     body = json.dumps({"detail": problems}, ensure_ascii=True).encode()
     return Response(body, 422, media_type="application/json")
+
+
+def _message(problem: dict[str, Any]) -> str:
+    """The message of a problem of a request: the cause that the parser states, and the usual cause of a wrong kind."""
+    if problem["type"] == "json_invalid":
+        return f"{problem['msg']}: {problem['ctx']['error']}"
+    if problem["type"] == "model_attributes_type" and problem["loc"] == ("body",):
+        twice = "; it is a text: was it encoded twice?" if isinstance(problem["input"], str) else ""
+        return f"the body should be one JSON object, {{…}}{twice}"
+    return str(problem["msg"])
 
 
 def stopping_person(scope: MutableMapping[str, Any], tokens: Tokens) -> Person | None:

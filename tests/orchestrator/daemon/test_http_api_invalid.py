@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,40 @@ async def test_another_media_type_is_named_and_the_body_is_not_echoed(tmp_path: 
             assert answer.status_code == 422
             assert "send application/json" in answer.json()["detail"]
             assert "secret" not in answer.text
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "message"),
+    [
+        # requests.post(json=json.dumps(…)), as in questions about FastAPI's "value is not a valid dict"
+        (
+            b'"{\\"text\\": \\"secret\\"}"',
+            422,
+            "the body should be one JSON object, {…}; it is a text: was it encoded twice?",
+        ),
+        # DataFrame.to_json(orient="records")
+        (b'[{"text": "secret"}]', 422, "the body should be one JSON object, {…}"),
+        # str() of a dict of Python, a comma after the last value, and a body that is cut off
+        (b"{'text': 'secret'}", 422, "JSON decode error: Expecting property name enclosed in double quotes"),
+        (b'{"text": "secret",}', 422, "double quotes"),
+        (b'{"text": "secret', 422, "JSON decode error: Unterminated string starting at"),
+        # str with an umlaut as data=, which http.client encodes in Latin-1, and a compressed body
+        ('{"text": "Krüge"}'.encode("latin-1"), 400, "the body is not text in UTF-8; send JSON in UTF-8"),
+        (gzip.compress(b'{"text": "secret"}'), 400, "not compressed"),
+        # what PowerShell and .NET write is read
+        (b'\xef\xbb\xbf{"text": "name: x"}', 422, "key 'laboratory' is missing"),
+        ('{"text": "name: x"}'.encode("utf-16"), 422, "key 'laboratory' is missing"),
+    ],
+)
+async def test_bodies_as_clients_send_them_are_read_or_refused_with_the_cause(
+    tmp_path: Path, body: bytes, status: int, message: str
+) -> None:
+    async with serving(tmp_path) as served:
+        headers = {**served.headers(Role.ADMIN), "Content-Type": "application/json"}
+        answer = await served.http.post("/api/v1/campaigns", content=body, headers=headers)
+        assert answer.status_code == status, answer.text
+        assert message in str(answer.json()["detail"])
+        assert "secret" not in answer.text
 
 
 async def test_no_value_of_an_invalid_request_is_echoed(tmp_path: Path) -> None:

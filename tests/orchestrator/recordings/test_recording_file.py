@@ -242,6 +242,32 @@ def test_a_recording_in_doubt_is_refused_with_one_error(tmp_path: Path, content:
 
 
 @pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        # rostopic echo -p, in nanoseconds; PlotJuggler; record.py of UR's RTDE client; an Arduino's plotter
+        ("%time,field.tilt,field.weight\n1609060363469351911,0,180\n", "%time: unknown column; did you mean 'time_s'?"),
+        ("__time,/arm/tilt_deg,mass_g\n0,0,180\n", "/arm/tilt_deg: unknown column; did you mean 'tilt_deg'?"),
+        ("timestamp actual_q_5 mass_g\n0.1 0 180\n", "cells are separated by spaces; save it with commas"),
+        ("time_s:0,tilt_deg:0,mass_g:180\n", "time_s:0: unknown column; did you mean 'time_s'?"),
+        # tables merged by pandas, a logger that was started again, one that lost its power, one that writes the unit
+        (
+            "time_s,tilt_deg,mass_g\n0,NaN,180\n",
+            "2:3: tilt_deg: 'NaN' is not a number; write it like 12.5; leave the cell",
+        ),
+        ("time_s,tilt_deg,mass_g\n0,0,180\ntime_s,tilt_deg,mass_g\n", "3:1: time_s: 'time_s' is not a number"),
+        ("time_s,tilt_deg,mass_g\n0,0,180\n\0\0\0\0\n", "pour.csv:3:1: has 1 cell, the header 3"),
+        ("time_s,tilt_deg,mass_g\n0,0,180 g\n", "2:5: mass_g: '180 g' is not a number"),
+    ],
+)
+def test_tables_of_other_loggers_are_refused_where_they_differ(tmp_path: Path, content: str, message: str) -> None:
+    written(tmp_path, ROWS)
+    (tmp_path / "pour.csv").write_text(content, encoding="utf-8")
+    with pytest.raises(ConfigError) as error:
+        load_recording(tmp_path / "pour.yaml")
+    assert message in str(error.value)
+
+
+@pytest.mark.parametrize(
     ("header", "row", "message"),
     [
         # M5Stack MiniScale logger: ISO 8601
