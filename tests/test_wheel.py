@@ -6,6 +6,7 @@ import importlib.metadata
 import json
 import mmap
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -146,6 +147,49 @@ def test_authors_of_plug_ins_test_them_with_what_the_wheel_carries(wheel: Path, 
     reported = python("-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "-k", A_FEW, "test_my_arm.py")
     assert "2 passed, 1 skipped" in reported
     assert "ArmBench.cut is missing" in reported
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("python", ["python3.11", "python3.13"])
+def test_the_wheel_with_all_extras_runs_the_quickstart_in_an_empty_environment(
+    wheel: Path, tmp_path: Path, python: str
+) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    if not starts(python):
+        pytest.skip(f"{python} is not installed")
+
+    def done(*command: str | Path, timeout: float = 600.0) -> str:
+        ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=timeout)
+        assert ended.returncode == 0, ended.stdout[-2000:] + ended.stderr[-2000:]
+        return ended.stdout
+
+    done(python, "-m", "venv", "empty")
+    programs = tmp_path / "empty" / "bin"
+    done(programs / "python", "-m", "pip", "install", "-q", f"{wheel}[all]", timeout=1800.0)
+    assert done(programs / "decant", "--version").split() == ["decant", wheel.name.split("-")[1]]
+    done(programs / "decant", "init", "lab")
+    campaign = "lab/campaigns/quickstart.yaml"
+    assert "ok (campaign" in done(programs / "decant", "validate", campaign)
+    done(programs / "decant", "run", campaign, "--quiet", timeout=1800.0)
+    (run,) = (tmp_path / "runs").glob("quickstart-*")
+    assert {"report.html", "theta.json"} <= {path.name for path in run.iterdir()}
+    assert list(run.glob("*.rrd"))
+
+
+def starts(python: str) -> bool:
+    """Whether there is such an interpreter; a version manager's may only say that there is none."""
+    try:
+        return subprocess.run([python, "--version"], capture_output=True, check=False).returncode == 0
+    except FileNotFoundError:
+        return False
+
+
+def test_the_wheel_has_the_version_of_the_newest_release_without_a_repository(wheel: Path) -> None:
+    """The wheel of this test is built from files; one of a repository counts the commits after the release."""
+    released = re.search(r"^## \[(\d+\.\d+\.\d+)\]", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)
+    assert released is not None
+    assert wheel.name.split("-")[1] == released[1]
 
 
 def test_every_package_of_an_extra_is_declared_in_it() -> None:
