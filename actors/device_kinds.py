@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from actors.arm.arm_settings import ArmDiagnostics, ArmEmulator, ArmKind
+from actors.arm.franka.franka_arm import FrankaRobot, FrankaSettings
 from actors.arm.joint_arm_kind import JointArmKind
 from actors.arm.planned_pour import MotionPath
 from actors.arm.simulated_arm import APPROACH_TIME, SimulatedArm, SimulatedArmSettings
 from actors.arm.ur.robot_models import MODELS, same_robot
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm.urdf_chain import ChainArmKind
 from actors.arm_geometry import RobotCell
 from actors.balance.balance_settings import BalanceEmulator, BalanceKind, SerialBalanceSettings
 from actors.balance.serial_port import look_at_port
@@ -27,9 +29,10 @@ from actors.grippers.onrobot_gripper import OnRobotSettings
 from actors.grippers.robotiq_gripper import RobotiqSettings
 from actors.interfaces import DeviceCheck, LaboratoryError
 from sim_engine.action import Action
+from sim_engine.resources import installed
 from sim_engine.scene import Scene
 from sim_engine.settings.model import Problems
-from sim_engine.settings.plugin_registry import own_extras
+from sim_engine.settings.plugin_registry import DISTRIBUTION, own_extras
 
 
 def _emulator(name: str) -> Any:
@@ -79,7 +82,7 @@ class UrArmKind(JointArmKind[UrArmSettings]):
     def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
         """See `ArmKind.check_laboratory`."""
         arm, spec = problems.within("arm"), self.spec
-        self._check_address(arm, mode)
+        _check_address(arm, spec.address, mode)
         if arm.valid("model", "rate"):
             fastest = MODELS[spec.model].frequency
             if spec.rate > fastest:
@@ -87,20 +90,6 @@ class UrArmKind(JointArmKind[UrArmSettings]):
         if arm.valid("model", "payload") and spec.payload > (most := MODELS[spec.model].payload):
             arm.add(f"a {spec.model} carries at most {most:g} kg", "payload")
         super().check_laboratory(problems, mode=mode, cell=cell)
-
-    def _check_address(self, problems: Problems, mode: str) -> None:
-        if mode != "hardware":
-            if self.spec.address:
-                problems.add("a virtual arm has no address: remove it, or write 'mode: hardware'", "address")
-        elif not self.spec.address:
-            text = "an arm of hardware needs its controller's 'address', for example 'address: 192.168.0.10'"
-            problems.add(text, of="address")
-        elif not _is_address(self.spec.address):
-            problems.add(
-                f"{self.spec.address!r} is neither an IPv4 address nor a host name; write for example '192.168.0.10', "
-                "no port",
-                "address",
-            )
 
     def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
         """See `ArmKind.driver`."""
@@ -146,6 +135,41 @@ class UrArmKind(JointArmKind[UrArmSettings]):
         from actors.arm.ur.commissioning import readiness
 
         return readiness(self.spec) if self.spec.address else None
+
+
+class FrankaKind(ChainArmKind[FrankaSettings]):
+    """A Franka arm."""
+
+    settings = FrankaSettings
+    robot = FrankaRobot
+    doses = emulated = True
+
+    def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
+        """See `ArmKind.check_laboratory`."""
+        arm = problems.within("arm")
+        _check_address(arm, self.spec.address, mode)
+        if mode == "virtual" and arm.valid("model") and self.spec.model != "fr3":
+            arm.add("the emulated Franka is an FR3; write 'fr3', or 'mode: hardware'", "model")
+        super().check_laboratory(problems, mode=mode, cell=cell)
+
+    def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
+        """See `ArmKind.driver`; a Franka reports no checksum of its safety settings."""
+        from actors.arm.joint_driver import VelocityArm
+
+        return VelocityArm, (self.spec, self.robot)
+
+    def start_emulator(self) -> ArmEmulator:
+        """See `ArmKind.start_emulator`."""
+        emulator: ArmEmulator = _emulator("franka")(self.spec)
+        return emulator
+
+    def missing(self) -> str | None:
+        """See `ArmKind.missing`."""
+        modules = ["pinocchio", "franky", *(() if self.spec.address else ("franky_sim",))]
+        if all(map(installed, modules)):
+            return None
+        extra = "franka" if self.spec.address else "franka-sim"
+        return f"a Franka arm needs packages that are not installed; run: pip install '{DISTRIBUTION}[{extra}]'"
 
 
 class SerialBalanceKind(BalanceKind[SerialBalanceSettings]):
@@ -202,6 +226,20 @@ class EmulatedOnRobotSettings(OnRobotSettings):
         """See `GripperSettings.start_emulator`."""
         emulator: GripperEmulator = _emulator("onrobot")(self)
         return emulator
+
+
+def _check_address(problems: Problems, address: str, mode: str) -> None:
+    if mode != "hardware":
+        if address:
+            problems.add("a virtual arm has no address: remove it, or write 'mode: hardware'", "address")
+    elif not address:
+        text = "an arm of hardware needs its controller's 'address', for example 'address: 192.168.0.10'"
+        problems.add(text, of="address")
+    elif not _is_address(address):
+        problems.add(
+            f"{address!r} is neither an IPv4 address nor a host name; write for example '192.168.0.10', no port",
+            "address",
+        )
 
 
 _LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"

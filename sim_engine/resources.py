@@ -151,6 +151,8 @@ EXTRAS = {
     "serial": "lab",
     "psutil": "lab",
     "pinocchio": "urdf",
+    "franky": "franka",
+    "franky_sim": "franka-sim",
     "rerun": "live",
     "apprise": "daemon",
     "fastapi": "daemon",
@@ -170,6 +172,8 @@ EXTRAS = {
 PACKAGES = {
     "serial": "pyserial",
     "pinocchio": "pin",
+    "franky": "franky-control",
+    "franky_sim": "franky-sim",
     "skimage": "scikit-image",
     "pythonjsonlogger": "python-json-logger",
     "unitelabs": "unitelabs-cdk",

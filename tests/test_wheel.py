@@ -196,7 +196,7 @@ def test_every_package_of_an_extra_is_declared_in_it() -> None:
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     package = {"serial": "pyserial", "rerun": "rerun-sdk"}
     package |= {"prometheus_client": "prometheus-client", "pythonjsonlogger": "python-json-logger"}
-    package |= {"skimage": "scikit-image", "pinocchio": "pin>"}
+    package |= {"skimage": "scikit-image", "pinocchio": "pin>", "franky_sim": "franky-sim"}
     for module, extra in EXTRAS.items():
         name = package.get(module, module)
         assert any(text.startswith(name) for text in declared["optional-dependencies"][extra]), name

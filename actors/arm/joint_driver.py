@@ -32,7 +32,15 @@ from actors.arm.arm_interface import (
 from actors.arm.joint_arm import JointArmSettings
 from actors.arm.planned_pour import ExecutedPath, JointPath, PlaceWay, PourPath
 from actors.arm.planning.kinematics import cell_transforms, pourer_motion
-from actors.arm.planning.motion_segments import MotionSegment, jog_path, leans, rejoin, upright_way, way_home
+from actors.arm.planning.motion_segments import (
+    UPRIGHT,
+    MotionSegment,
+    jog_path,
+    leans,
+    rejoin,
+    upright_way,
+    way_home,
+)
 from actors.arm.planning.path_checks import recheck
 from actors.arm_geometry import Pose
 from actors.interfaces import LaboratoryError
@@ -116,7 +124,11 @@ class JointRobot(Protocol):
 
 
 class VelocityRobot(JointRobot, Protocol):
-    """A robot that takes joint speeds; see `VelocityArm`. Its `begin` is not used."""
+    """A robot that takes joint speeds; see `VelocityArm`. Its `begin` is not used.
+
+    If it has a method `pours`, that is called before each motion: with the pour on whose path the cup is tilted, or
+    with None. Such a robot brings the cup upright by itself once its driver is gone.
+    """
 
     def turn(self, speeds: FloatArray, seconds: float) -> None:
         """Turn the joints at speeds (n,) [rad/s] until the next call, for so long at most [s], and then stand."""
@@ -250,6 +262,7 @@ class JointArm:
             poured = path or self._last_pour
             if poured is None:
                 raise ArmRefusedError("no pour is known that was stopped; bring the pourer upright at the robot")
+            self._last_pour = poured
             way, tilts = upright_way(poured, self._read().joints, self._spec)
             self._go(MotionSegment(way, (("untilt", 0.0, way.duration),), tilts))
             self._released_at = None
@@ -358,7 +371,9 @@ class JointArm:
                 raise ArmStoppedError("stopped before it moved", "operator", "announced", 0.0, segment.tilt(0.0))
         start = self._check_start(segment)  # the arm may have been moved meanwhile; and its motion counts from here
         times, joints = [0.0], [start.joints]
-        self._state = replace(self._state, moving=True, phase="dose" if move else segment.phase(0.0), fraction=0.0)
+        self._state = replace(
+            self._state, moving=True, phase="dose" if move else segment.phase(0.0), time=0.0, fraction=0.0
+        )
         try:
             ended = self._follow(segment, times, joints) if move is None else move(times, joints)
         except BaseException as error:
@@ -402,7 +417,7 @@ class JointArm:
                 times.append(now)
                 joints.append(reading.joints)
                 arrived = time.monotonic()
-                self._clock.promise("arm", LATEST)
+                self._clock.promise("arm", self._spec.on_clock(LATEST))
                 yield replace(reading, time=now)
             elif time.monotonic() - arrived > patience:
                 raise ConnectionError("the robot reports nothing new")
@@ -411,8 +426,8 @@ class JointArm:
     def _begin(self, path: JointPath) -> None:
         self.robot.begin(path)
 
-    def _steer(self, path: JointPath, reading: JointReading, apart: FloatArray) -> None:
-        """Called for each reading of a path; `apart` is the distance of each joint from the path [rad]."""
+    def _steer(self, path: JointPath, reading: JointReading) -> None:
+        """Called for each reading of a path."""
 
     def _follow(self, segment: MotionSegment, times: list[float], joints: list[FloatArray]) -> _Ended | None:
         path, reason, before = segment.path, ("", ""), 0.0
@@ -446,7 +461,7 @@ class JointArm:
                 self.robot.halt()
                 away = f"the arm ended {np.degrees(np.abs(apart).max()):.1f}° away from the end of its path"
                 return _Ended("program ended", away, path.duration, tuple(joints[-1].tolist()))
-            self._steer(path, reading, apart)
+            self._steer(path, reading)
         raise AssertionError("readings do not end")
 
     def _executed(self, times: list[float], joints: list[FloatArray], completed: bool) -> ExecutedPath:
@@ -476,6 +491,21 @@ class _Dose:
         return joints[2], (joints[1] - joints[0]) / (near[1] - near[0])
 
 
+def speeds_along(path: JointPath, time: float, span: float, joints: FloatArray) -> FloatArray:
+    """Speeds that keep joints on a path until about the next command, shape (n,) [rad/s].
+
+    Args:
+        path: to be followed.
+        time: on the path [s].
+        span: time since the last command [s].
+        joints: measured, shape (n,) [rad].
+    """
+    span = min(max(span, SHORTEST), LATEST)
+    here, ahead = path.at(np.array([time, time + span]))
+    speeds: FloatArray = (ahead - here) / span + GAIN * (here - joints)
+    return speeds
+
+
 class VelocityArm(JointArm):
     """The driver of an arm that takes joint speeds: it follows paths, and pours wanted amounts (`DosingArm`).
 
@@ -499,12 +529,16 @@ class VelocityArm(JointArm):
     def _begin(self, path: JointPath) -> None:
         self._steered_at = 0.0
 
-    def _steer(self, path: JointPath, reading: JointReading, apart: FloatArray) -> None:
-        span = min(max(reading.time - self._steered_at, SHORTEST), LATEST)
+    def _steer(self, path: JointPath, reading: JointReading) -> None:
+        speeds = speeds_along(path, reading.time, reading.time - self._steered_at, reading.joints)
         self._steered_at = reading.time
-        ahead = path.at(np.array([reading.time, reading.time + span]))  # until about the next command
-        speeds = (ahead[1] - ahead[0]) / span + GAIN * apart
         self._robot.turn(np.clip(speeds, -self._fastest, self._fastest), HOLD)
+
+    def _go(self, segment: MotionSegment, move: _Move | None = None) -> ExecutedPath:
+        self._consent()
+        if (pours := getattr(self._robot, "pours", None)) is not None:
+            pours(self._last_pour if segment.tilts.max() > UPRIGHT else None)
+        return super()._go(segment, move)
 
     def dose(self, path: PourPath, longest: float) -> ExecutedPath:
         """See `DosingArm.dose`."""

@@ -57,7 +57,7 @@ FloatArray = NDArray[np.float64]
 DEADLINE = 30.0 * PATIENCE
 """Longest wait for any reply of the emulators [s]; their process may still be starting."""
 
-AT_START = 2e-3
+AT_START = 0.01
 """Largest joint distance from the pour's first pose at which the arm counts as standing there [rad]."""
 
 AT_REST = 1e-6

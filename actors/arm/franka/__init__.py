@@ -1,0 +1,1 @@
+"""The driver of Franka arms, and their descriptions."""

@@ -1,0 +1,1 @@
+"""The emulated Franka of a virtual bench: franky-sim."""

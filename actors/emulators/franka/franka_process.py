@@ -1,0 +1,217 @@
+"""`python -m actors.emulators.franka.franka_process`: franky-sim with the clock of a virtual bench.
+
+The simulated robot speaks libfranka's protocol at its address. The devices of the bench wait for it, and it for them:
+while a client moves it, their clock is the simulation's, which may be slower than the wall clock. While it stands,
+their clock is the wall clock, and the robot's own time runs slower, since nothing happens in it. A client may be late
+by `LATE`, then the robot waits for it, since the host may be slow; a real one stops.
+
+A line of JSON is answered by a line of JSON: `{"since": t}` by the joints since a time of the robot, `{"pace": s}` sets
+the bench seconds per second of the clock, `{"orders": ["trip"]}` is a fault.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import sys
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from franky_sim import franka_robot_server
+from franky_sim.franka_robot_protocol import (
+    AutomaticErrorRecoveryCommand,
+    BaseCommand,
+    MoveStatus,
+    RobotCommand,
+    RobotMode,
+)
+from franky_sim.mujoco_simulator import MujocoSimulator
+
+from actors.runtime.bench_clock import SharedClock
+
+TICK = 1e-3
+"""Control cycle of the robot [s]."""
+
+LATE = 10
+"""Cycles by which the client's commands may be late before the robot waits for them."""
+
+HANGS = 2.0
+"""Time after which it no longer waits: its client hangs [s]."""
+
+EVERY = 8
+"""Cycles between two samples of the history."""
+
+CREEP = 2e-4
+"""Changes of the joints that do not count [rad]: a standing robot of franky-sim sags by a little more."""
+
+SILENCE = 0.2
+"""Wall time after which a moving robot makes a cycle although the clock of the bench stands [s]: libfranka counts a
+second of silence as a lost connection."""
+
+KEPT = 120.0
+"""Time for which samples are kept [s]."""
+
+STANDING = 4e-3
+"""Time between two cycles while no client moves the robot [s of the clock]."""
+
+
+class Ports(franka_robot_server.FrankaRobotServer):  # type: ignore[misc]  # it has no types
+    """The robot's ports, with what franky-sim leaves out: late clients, reflexes, a pulled cable."""
+
+    reflex = unplugged = False
+    quiet = 0
+    """States that were sent since the last command of a motion; 0 before its first one."""
+
+    def start_motion(self, *arguments: Any) -> None:
+        """Begin a motion."""
+        self.quiet = 0
+        super().start_motion(*arguments)
+
+    def _handle_udp_command(self, command_data: bytes) -> None:
+        self.quiet = 1
+        super()._handle_udp_command(command_data)
+
+    def send_state(self) -> None:
+        """Send the state to a client."""
+        super().send_state()
+        self.quiet += self.quiet > 0
+
+    @property
+    def late(self) -> bool:
+        """Whether the robot has to wait for its client's command."""
+        return self.current_motion_id > 0 and self.quiet > LATE
+
+    @property
+    def robot_state(self) -> Any:
+        """The state that is sent."""
+        state = super().robot_state
+        return state.replace(robot_mode=RobotMode.kReflex) if self.reflex else state
+
+    def trip(self) -> None:
+        """Stop with a reflex."""
+        self.reflex = True
+        if motion := self.current_motion_id:
+            self.stop_motion(send_preemption_signal=False)
+            BaseCommand.send_response(self._tcp_socket, RobotCommand.kMove, motion, MoveStatus.kReflexAborted)
+            self.reset_current_motion_id()
+
+
+class Recovery(AutomaticErrorRecoveryCommand):  # type: ignore[misc]  # it has no types
+    """A client's word that the robot may recover from a reflex."""
+
+    def handle(self, server: Any) -> None:
+        """Recover."""
+        server.reflex = False
+        super().handle(server)
+
+
+class VirtualFranka:
+    """The simulated robot, its clock and its history.
+
+    Args:
+        simulator: it has one robot.
+        address: of the robot's ports.
+        clock: of the bench.
+        time_scale: bench seconds per second of the clock.
+    """
+
+    def __init__(self, simulator: MujocoSimulator, address: str, clock: SharedClock, time_scale: float) -> None:
+        self._simulator, self._clock, self._scale = simulator, clock, time_scale
+        (self._robot,) = simulator.robots
+        franka_robot_server.AutomaticErrorRecoveryCommand = Recovery  # the class that a new server looks up
+        self._ports = Ports(self._robot, [address])
+        self._ports.init()
+        simulator.start()
+        self._samples: deque[tuple[float, list[float]]] = deque(maxlen=round(KEPT / (EVERY * TICK)))
+        self._cycles = 0
+        self._orders: deque[str] = deque()
+        self._ended = threading.Event()
+
+    def run(self) -> None:
+        """Run control cycles until the input ends."""
+        threading.Thread(target=self._answer, daemon=True).start()
+        due = time.monotonic()
+        while not self._ended.is_set():
+            moves = self._ports.current_motion_id > 0
+            period, longest = (TICK / self._scale, SILENCE) if moves else (STANDING, STANDING)
+            waits = time.monotonic() + longest
+            while not (passes := self._clock.may_pass(period)) and time.monotonic() < waits:
+                self._clock.advance(0.0)
+                time.sleep(2e-4)
+            self._cycle()
+            self._clock.advance(period if passes else 0.0)
+            due = max(due + period, time.monotonic() - 0.1)  # never faster than the wall clock, but for short delays
+            if (left := due - time.monotonic()) > 0.0:
+                time.sleep(left)
+        self._ports.cleanup()
+
+    def _cycle(self) -> None:
+        ports = self._ports
+        while self._orders:
+            match self._orders.popleft():
+                case "trip":
+                    ports.trip()
+                case "mend":
+                    ports.reflex = False
+                case "unplug":
+                    ports.reset_state()
+                    ports.unplugged, self._held = True, self._robot.inner_state.q
+                case "plug":
+                    ports.unplugged = False
+        if ports.unplugged:
+            self._robot.joint_position_control(self._held)
+        else:
+            ports.process_commands()
+            hangs = time.monotonic() + HANGS
+            while ports.late and time.monotonic() < hangs:
+                self._clock.advance(0.0)
+                time.sleep(2e-4)
+                ports.process_commands()
+            if ports.late:
+                ports.trip()
+        self._simulator.step()
+        ports.send_state()
+        self._cycles += 1
+        if self._cycles % EVERY == 0:
+            joints, before = list(map(float, self._robot.inner_state.q)), self._samples[-1][1] if self._samples else []
+            if before and max(abs(a - b) for a, b in zip(joints, before, strict=True)) < CREEP:
+                joints = before
+            self._samples.append((self._cycles * TICK, joints))
+
+    def _answer(self) -> None:
+        for line in sys.stdin:
+            request = json.loads(line)
+            self._scale = request.get("pace", self._scale)
+            self._orders.extend(request.get("orders", []))
+            later = [(t, q) for t, q in list(self._samples) if t > request.get("since", 1e12)]
+            _say({"now": self._cycles * TICK, "times": [t for t, _ in later], "joints": [q for _, q in later]})
+        self._ended.set()
+
+
+def main() -> None:
+    """Serve until the input ends."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--address", required=True)
+    parser.add_argument("--clock", required=True, type=Path)
+    parser.add_argument("--time-scale", type=float, default=1.0)
+    parser.add_argument("--joints", required=True)
+    chosen = parser.parse_args()
+    joints = [float(q) for q in chosen.joints.split(",")]
+    with contextlib.redirect_stdout(sys.stderr), MujocoSimulator() as simulator:
+        simulator.add_robot(initial_q=joints)
+        robot = VirtualFranka(simulator, chosen.address, SharedClock(chosen.clock), chosen.time_scale)
+        _say({"ready": chosen.address})
+        robot.run()
+
+
+def _say(answer: dict[str, Any]) -> None:
+    sys.__stdout__.write(json.dumps(answer) + "\n")  # type: ignore[union-attr]
+    sys.__stdout__.flush()  # type: ignore[union-attr]
+
+
+if __name__ == "__main__":
+    main()
