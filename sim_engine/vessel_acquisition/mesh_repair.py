@@ -510,7 +510,7 @@ def _joined(vertices: Floats, faces: Integers, log: _Log) -> tuple[Floats, Integ
     if len(parts) == 1:
         return _arrays(solid)
     joined = _arrays(manifold3d.Manifold.batch_boolean(parts, manifold3d.OpType.Add))
-    log.compare(f"{len(parts)} parts that touch were joined", log.capacity(vertices, faces), log.capacity(*joined))
+    log.compare(f"{len(parts)} parts were joined", log.capacity(vertices, faces), log.capacity(*joined))
     return joined
 
 

@@ -9,6 +9,7 @@ import pytest
 import decant
 from actors.arm.pour_feasibility import path_of
 from actors.arm.ur.robot_models import MODELS
+from actors.arm_geometry import Pose
 from actors.emulators.ur_controller.robot import calibrated
 from actors.interfaces import InvalidActionError
 
@@ -24,6 +25,10 @@ def test_a_pour_at_the_limit_is_made_by_the_robot_as_by_its_drawing() -> None:
     assert executed is not None
     assert planned.report.joint_speed == pytest.approx(limit)
     assert executed.report.joint_speed > 1.0005 * limit
+    # the last joint tilts the pourer, unless it is held obliquely
+    assert drawing.tilt_speed_limit == robot.tilt_speed_limit == limit < drawing.limits.tilt_speed  # type: ignore[union-attr]
+    oblique = drawing.with_values(grip=Pose(y=-0.06, rx=math.radians(-60)))  # type: ignore[union-attr]
+    assert oblique.tilt_speed_limit == drawing.limits.tilt_speed  # type: ignore[union-attr]
     for arm, factor in ((drawing, 1.001), (robot, 1.01)):
         with pytest.raises(InvalidActionError, match=r"joint 6 \(wrist 3\) would turn at"):
             path_of(scene, action.with_values(angular_velocity=factor * limit), arm)

@@ -21,7 +21,7 @@ from actors.optimizer.suggest import propose, slices
 from actors.runtime.child_process import child_environment
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.learning.requests import Pour, Simulate, Simulated, Suggest, Suggested
-from orchestrator.live_view.blueprints import campaign_blueprint
+from orchestrator.live_view.blueprints import Moment, campaign_blueprint
 from orchestrator.live_view.learning_view import slices_picture, surrogate_picture
 from orchestrator.live_view.rerun_subscriber import QueueThread, RerunMonitor
 from orchestrator.live_view.run_recording import CampaignRecording
@@ -171,6 +171,15 @@ def test_the_last_pictures_are_shown_wherever_the_time_cursor_is(recorded: Conte
     pictures = [view.origin for view in views(replay) if isinstance(view, rrb.Spatial2DView)]
     assert pictures
     assert all(str(origin).startswith("/outcome/learning/") for origin in pictures)
+
+
+@pytest.mark.parametrize(
+    ("moment", "timeline", "state"),
+    [("calibrating", "wall", "following"), ("deploying", "wall", "following"), ("replaying", "sim_time", "playing")],
+)
+def test_no_view_opens_paused(moment: Moment, timeline: str, state: str) -> None:
+    panel = campaign_blueprint(moment, {"narrow cup": "narrow"}, "loss").time_panel
+    assert (panel.timeline, panel.play_state) == (timeline, state)
 
 
 def views(container: Any) -> Iterator[Any]:
