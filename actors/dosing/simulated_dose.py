@@ -8,6 +8,7 @@ Limitations: without particles straight cups only.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
@@ -76,11 +77,18 @@ def simulated_dose(
     check_dose(scene, dose)
     if particles is None:
         check_straight(scene)
-    poured = None if particles is None else _poured(particles, progress)
+    frames: list[RecordedFrames] = []
+
+    def liquid(bench: VirtualDosingBench) -> ParticleLiquid:
+        assert particles is not None
+        task, pours = particles(bench.content)
+        return ParticleLiquid(bench, pours, task, None if progress is None else frames.append)
+
+    poured = None if particles is None else liquid
     series, bench, placed = _set_up(scene, dose, seed, settings, held_tilt, poured)
     loaded = bench.content
     controller = series.controller(DoseOrder(dose.amount, dose.limit, receiver_mass=bench.receiver_mass), seed=seed)
-    record = bench.dose(controller if progress is None else _Shown(controller, progress))
+    record = bench.dose(controller if progress is None else _Shown(controller, progress, frames))
     result = controller.result
     assert result is not None, "a dose ends within LONGEST_DOSE"
     if result.amount is None:
@@ -91,27 +99,17 @@ def simulated_dose(
     return PourMeasurement(loaded, record.spilled, retained, {"dose": notes})
 
 
-def _poured(
-    particles: Callable[[float], tuple[PourTask, LivePours]], progress: ProgressCallback | None
-) -> Callable[[VirtualDosingBench], ParticleLiquid]:
-    """Makes the liquid of a dose of particles, whose frames are reported."""
-
-    def show(frames: RecordedFrames) -> None:
-        if progress is not None:
-            progress(PourProgress("dose", 0.0, liquid=frames))
-
-    def liquid(bench: VirtualDosingBench) -> ParticleLiquid:
-        task, pours = particles(bench.content)
-        return ParticleLiquid(bench, pours, task, None if progress is None else show)
-
-    return liquid
-
-
 class _Shown:
-    """A controller that reports what it estimates: ten times a second of the dose, and whenever its phase changes."""
+    """A controller that reports what it estimates: ten times a second of the dose, and whenever its phase changes.
 
-    def __init__(self, controller: DoseController, progress: ProgressCallback) -> None:
-        self._controller, self._progress = controller, progress
+    Args:
+        controller: decides.
+        progress: receives the reports.
+        frames: of the particles since the last report.
+    """
+
+    def __init__(self, controller: DoseController, progress: ProgressCallback, frames: list[RecordedFrames]) -> None:
+        self._controller, self._progress, self._frames = controller, progress, frames
         self._phase, self._next = DosePhase.CHECK, 0.0
         self._zero: float | None = None
 
@@ -126,7 +124,9 @@ class _Shown:
             reading = None if last is None or self._zero is None else last - self._zero
             shown = self._controller.progress(reading)
             done = min(max(shown.amount / shown.target, 0.0), 1.0)
-            self._progress(PourProgress("dose", done, tilt=tilt, balance=reading, dose=shown))
+            liquid = functools.reduce(RecordedFrames.joined, self._frames) if self._frames else None
+            self._frames.clear()
+            self._progress(PourProgress("dose", done, tilt=tilt, balance=reading, liquid=liquid, dose=shown))
         return command
 
 

@@ -189,6 +189,37 @@ def test_the_particles_of_a_dose_are_shown_live_or_in_a_playback(tmp_path: Path,
 
 
 @pytest.mark.slow
+def test_a_simulated_bench_pours_particles_which_the_recording_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DECANT_STATE", str(tmp_path / "state"))
+    text = SERIES.replace("liquid: {particles: 400}", "doses: particles, liquid: {particles: 400}")
+    plan = load_campaign(write_campaign(tmp_path, text.replace("receiver: narrow", "receiver: tumbler")))
+    path, seen = tmp_path / "dose.rrd", list[PourProgress]()
+    monitor = RerunMonitor(path, plan)
+
+    def subscriber(event: Event) -> None:
+        monitor(event)
+        if isinstance(event, PourProgressed):
+            seen.append(event.progress)
+
+    async def scenario() -> Any:
+        resources = RunResources(in_process=True, subscribers=[subscriber])
+        with contextlib.closing(RunService().start(run_task(plan), resources)) as handle:
+            return await handle.wait()
+
+    (dose,) = asyncio.run(scenario()).results["doses"].doses
+    assert monitor.close(timeout=PATIENCE)
+    assert dose.received_g == pytest.approx(25.0, abs=5.0)  # one particle is 0.25 g
+    frames = [progress.liquid for progress in seen if progress.liquid is not None]
+    assert len(frames) > 20
+    assert (frames[-1].states[-1] == ParticleState.RECEIVED).mean() == pytest.approx(dose.received_g / 100.0, abs=0.02)
+    assert {progress.dose is None for progress in seen if progress.liquid is not None} == {False}
+    fates = Contents(path).values("/cell/liquid", "Points3D:class_ids")
+    assert len(fates) > 20
+
+
+@pytest.mark.slow
 def test_the_rack_of_mixtures_fills_in_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DECANT_STATE", str(tmp_path / "state"))
     plan = load_campaign(write_campaign(tmp_path, MIXTURES))
