@@ -165,6 +165,22 @@ async def test_particles_are_poured_over_the_wires_and_the_source_keeps_the_rest
 
 
 @pytest.mark.slow
+async def test_a_dose_whose_simulation_is_killed_is_unknown_and_the_next_one_is_poured(open_stage: OpenStage) -> None:
+    spec = dosing_spec()
+    assert spec.bench is not None
+    spec = spec.with_values(bench=spec.bench.with_values(doses="particles", liquid=TrueLiquid(particles=1000)))
+    async with open_stage(spec) as stage:
+
+        async def strike() -> None:
+            child = stage.site.device._object._pours._child  # type: ignore[attr-defined]
+            os.kill(child.pid, signal.SIGKILL)
+
+        reason = await broken_off(stage, strike)
+        assert "the process that simulates the liquid of doses has died" in reason
+        check_amount(stage, await dosed(stage, 40.0), 40.0)
+
+
+@pytest.mark.slow
 async def test_a_mixture_is_poured_from_two_sources_into_a_cup_that_comes_back(open_stage: OpenStage) -> None:
     series = mixtures.plan({"water": 25.0, "oil": 15.0})
     strategy = Mix(series, 3)

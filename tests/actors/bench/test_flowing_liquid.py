@@ -7,6 +7,7 @@ from __future__ import annotations
 import itertools
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -173,14 +174,19 @@ def test_frames_for_a_live_view_are_kept_with_the_time_of_the_dose() -> None:
     assert unwatched.frames() is None
 
 
-def test_a_simulation_that_fails_ends_the_flow_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Kind:
-        def figure(self) -> object:
-            return self
+class Kind:
+    """An arm that holds a cup tilted."""
 
-        def pourer_motion(self, joints: object, times: NDArray[np.float64], grip_tilt: float) -> SampledMotion:
-            return SampledMotion(times, np.array([TILTED] * len(times)))
+    def figure(self) -> object:
+        return self
 
+    def pourer_motion(self, joints: object, times: NDArray[np.float64], grip_tilt: float) -> SampledMotion:
+        return SampledMotion(times, np.array([TILTED] * len(times)))
+
+
+def tilted(
+    monkeypatch: pytest.MonkeyPatch, drips: Drips, put: Callable[[float], None], *, on_tray: bool
+) -> FlowingLiquid:
     monkeypatch.setattr(flowing_liquid, "arm_kind", lambda spec: Kind())
     clock = itertools.count(1.0, 0.1)
 
@@ -188,9 +194,31 @@ def test_a_simulation_that_fails_ends_the_flow_with_its_reason(monkeypatch: pyte
         now = next(clock)
         return Motion((now,), ((0.0,) * 6,), now)
 
-    order = FlowOrder(DOSE, base=0.1)
-    arm = UrArmSettings.model_construct()
-    liquid = FlowingLiquid(order, arm, history, lambda mass: None, Drips(invalid="particles crossed vessel walls"))
+    return FlowingLiquid(FlowOrder(DOSE, 0.1, on_tray=on_tray), UrArmSettings.model_construct(), history, put, drips)
+
+
+@pytest.mark.parametrize("on_tray", [False, True])
+def test_what_is_spilled_loads_the_balance_only_if_the_tray_stands_on_it(
+    monkeypatch: pytest.MonkeyPatch, on_tray: bool
+) -> None:
+    drips, loads, some = Drips(), list[float](), threading.Event()
+
+    def put(load: float) -> None:
+        loads.append(load)
+        if len(drips.landed) >= 4:
+            some.set()
+
+    liquid = tilted(monkeypatch, drips, put, on_tray=on_tray)
+    assert some.wait(PATIENCE)
+    end = liquid.end()
+    assert end.spilled > 0.0
+    assert loads[-1] == pytest.approx(0.1 + end.received + (end.spilled if on_tray else 0.0))
+    assert loads == sorted(loads)
+
+
+def test_a_simulation_that_fails_ends_the_flow_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = Drips(invalid="particles crossed vessel walls")
+    liquid = tilted(monkeypatch, broken, lambda mass: None, on_tray=False)
     liquid._thread.join(PATIENCE)
     assert not liquid._thread.is_alive()
     with pytest.raises(LaboratoryError, match="could not be simulated: particles crossed vessel walls"):
