@@ -116,6 +116,20 @@ class Pose(Named):
         return [self.x, self.y, self.z, self.rx, self.ry, self.rz]
 
 
+def rotated(pose: Pose, vector: Vector) -> Vector:
+    """A vector of the posed frame in the frame that the pose refers to (Rodrigues' formula)."""
+    angle = math.hypot(pose.rx, pose.ry, pose.rz)
+    x, y, z = (component / (angle or 1.0) for component in (pose.rx, pose.ry, pose.rz))
+    u, v, w = vector
+    along = (x * u + y * v + z * w) * (1.0 - math.cos(angle))
+    crossed = (y * w - z * v, z * u - x * w, x * v - y * u)
+    a, b, c = (
+        old * math.cos(angle) + new * math.sin(angle) + axis * along
+        for old, new, axis in zip(vector, crossed, (x, y, z), strict=True)
+    )
+    return a, b, c
+
+
 class Mount(Settings):
     """Mounting of the robot: rotation about its own z axis, then tilt about the x axis of the base frame."""
 

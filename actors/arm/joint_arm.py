@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Self
 
 from actors.arm.arm_settings import ArmSettings
-from actors.arm_geometry import ArmLimits, Centre, Mount, Pose, RobotCell, Speed
+from actors.arm_geometry import ArmLimits, Centre, Mount, Pose, RobotCell, Speed, rotated
 from sim_engine.settings.model import SET_BY_PROGRAM, Example
 from sim_engine.settings.quantity import Quantity
 
@@ -206,13 +206,11 @@ class JointArmSettings(ArmSettings):
         """See `ArmSettings.tilt_speed_limit`; the limit of the last joint too, if the pourer turns about its axis."""
         import numpy as np
 
-        from actors.arm.planning.kinematics import transform_of
-
         home = np.array([self.home_joints, self.home_joints])
         home[1, -1] += 1.0
         before, after = self.kinematics.forward(home)[0]
-        held = (transform_of(self.tool) @ transform_of(self.grip)).rotation
-        if (held.T @ before.T @ after @ held)[1, 1] < 1.0 - 1e-6:
+        axis = np.array(rotated(self.tool, rotated(self.grip, (0.0, 1.0, 0.0))))  # of the tilt, in the flange's frame
+        if np.linalg.norm(before.T @ after @ axis - axis) > 1e-3:
             return self.limits.tilt_speed
         return min(self.limits.tilt_speed, self.limits.joint_speed, self.kinematics.joint_speed[-1])
 
