@@ -30,6 +30,9 @@ from actors.runtime.bench_clock import SharedClock
 SLOWEST_WAKE = 0.002
 """Shortest wall time between two wake-ups of the clock [s]; in scaled time, each wake-up runs several ticks."""
 
+TRANSLATION_WAKE = 0.02
+"""The same while a program is translated, whose thread each wake-up interrupts."""
+
 MOST_BEHIND = 0.1
 """Longest lag of the clock in wall time [s]; more is dropped, because a controller never runs faster to catch up."""
 
@@ -207,7 +210,8 @@ class Host:
             # A defect in this program: ending is better than a clock that silently stands still.
             traceback.print_exc()
             raise SystemExit(1) from None
-        self._clock = loop.call_at(max(self._next, now + min(period, SLOWEST_WAKE)), self._wake)
+        shortest = TRANSLATION_WAKE if uploads.translating else min(period, SLOWEST_WAKE)
+        self._clock = loop.call_at(max(self._next, now + shortest), self._wake)
 
     def _runs(self, period: float) -> bool:
         """Whether time passes: not while a program is loaded, or while the bench waits for a program that is late."""

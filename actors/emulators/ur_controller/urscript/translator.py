@@ -82,7 +82,7 @@ class _PythonText:
         begins = bool(word) and word not in _IN_EXPRESSIONS
         if begins and self._brackets:
             raise ScriptError(f"expected ')' or ']', found '{word}'", token.line)
-        is_value = token.kind in ("number", "string", "name") or word in _TRUTH or word == "run"
+        is_value = token.kind in ("number", "numbers", "string", "name") or word in _TRUTH or word == "run"
         follows = token.fresh or (is_value and self._statement != ["return"])
         if token.kind == "end of text" or begins or (self._ends_value and follows and not self._brackets):
             self._finish(token)
@@ -119,6 +119,8 @@ class _PythonText:
         match token.kind:
             case "number":
                 return repr(_number(token))
+            case "numbers":
+                return f"b'{text[1:-1]}'"  # see `_Translation.visit_Constant`
             case "string":
                 return repr(text)
             case "name":
@@ -286,6 +288,13 @@ class _Translation(ast.NodeTransformer):
         if isinstance(operand, ast.Constant) and type(operand.value) in (int, float):
             return ast.Constant(-operand.value)  # type: ignore[operator]
         return _called("_neg", operand)
+
+    def visit_Constant(self, node: ast.Constant) -> ast.expr:
+        """Bytes are the numbers of a list."""
+        if not isinstance(node.value, bytes):
+            return node
+        numbers: Any = tuple(float(n) if "." in n else int(n) for n in node.value.decode().split(","))
+        return ast.List([ast.Starred(ast.Constant(numbers), ast.Load())], ast.Load())
 
     def visit_Compare(self, node: ast.Compare) -> ast.AST:
         """One operator."""

@@ -131,6 +131,26 @@ out(kept[0])
     assert result(text) == [1, 99, 1]
 
 
+decimals = st.floats(-1e6, 1e6).map(lambda x: f"{x:.6f}") | st.integers(-(10**9), 10**9).map(str)
+
+
+@settings(max_examples=examples(50))
+@given(numbers=st.lists(decimals, min_size=2, max_size=7))
+def test_a_list_of_plain_numbers_is_the_list_that_is_written_otherwise(numbers: list[str]) -> None:
+    plain, otherwise = result(f"x = [{', '.join(numbers)}]\nout(x)\nout([ {' , '.join(numbers)} ])")
+    assert plain == otherwise == [float(n) if "." in n else int(n) for n in numbers]
+    assert list(map(type, plain)) == list(map(type, otherwise))
+
+
+def test_plain_numbers_after_a_value_are_an_index() -> None:
+    assert result("x = [[1, 2], [3, 4.5]]\nout(x[1, 1])\nout([[5, 6], [7, 8]][1, 0])\nx[0, 1] = 9\nout(x)") == [
+        4.5,
+        7,
+        [[1, 9], [3, 4.5]],
+    ]
+    assert result("x = [1, 2]\ny = x\ny[0] = 3\nout(x)\nout(p[1, 2, 3, 4, 5, 6])")[0] == [1, 2]
+
+
 def test_functions_have_defaults_and_named_arguments() -> None:
     assert result("def f(a, b=2, c=3):\n  return a * 100 + b * 10 + c\nend\nout(f(1))\nout(f(1, c=5))") == [123, 125]
 
