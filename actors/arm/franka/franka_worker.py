@@ -16,6 +16,7 @@ import contextlib
 import math
 import re
 import sys
+import time
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
@@ -54,6 +55,9 @@ SAME_TOOL = 2e-3, math.radians(1.0)
 
 ERRORS = franky.Exception, RuntimeError
 """Of the client library; not all of them have a class."""
+
+ATTEMPTS = 10
+"""Readings of the state that may fail in a row."""
 
 MODES = {
     "Other": "it is not ready: open its brakes in Desk, choose 'Execution', and activate FCI",
@@ -212,13 +216,17 @@ class Worker:
     @property
     def _state(self) -> Any:
         """The newest state: without a motion, the oldest one in the socket's buffer comes first."""
-        try:
-            state = self._robot.state
-        except franky.Exception:
-            raise
-        except RuntimeError:  # reports once that a motion has ended with an error of the network's library
-            return self._robot.state
-        return state if self._robot.is_in_control else self._robot.state
+        for left in reversed(range(ATTEMPTS)):
+            try:
+                state = self._robot.state
+                return state if self._robot.is_in_control else self._robot.state
+            except franky.Exception:
+                raise
+            except RuntimeError:  # an error of the network's library, seen on busy computers
+                if not left:
+                    raise
+                time.sleep(2e-3)
+        raise AssertionError
 
     def _now(self) -> float:
         return 0.0 if self._robot is None else float(self._state.time.to_sec())
