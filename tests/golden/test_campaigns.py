@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import importlib.util
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -148,6 +149,7 @@ SHIPPED = sorted(
     path.relative_to(ROOT / "configs").as_posix()
     for folder in ("campaigns", "laboratories", "studies", "vessels")
     for path in (ROOT / "configs" / folder).glob("*.yaml")
+    if path.stem != "franka" or importlib.util.find_spec("franky_sim") is not None  # of an extra
 )
 
 
