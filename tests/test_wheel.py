@@ -180,7 +180,8 @@ def test_the_wheel_with_all_extras_runs_the_quickstart_in_an_empty_environment(
 def starts(python: str) -> bool:
     """Whether there is such an interpreter; a version manager's may only say that there is none."""
     try:
-        return subprocess.run([python, "--version"], capture_output=True, check=False).returncode == 0
+        command = [python, "--version"]
+        return subprocess.run(command, env=child_environment(), capture_output=True, check=False).returncode == 0
     except FileNotFoundError:
         return False
 

@@ -255,7 +255,7 @@ class MotionSegment:
         """The message about a motion whose connection was lost."""
         return (
             f"Last seen during {self.phase(clock)}, {clock:.2f} s after its begin, the pourer tilted by "
-            f"{np.degrees(self.tilt(clock)):.0f}°; the program on the controller ends by its watchdog"
+            f"{np.degrees(self.tilt(clock)):.0f}°"
         )
 
 

@@ -69,6 +69,9 @@ UPRIGHT_TIME = 3.5
 TILT_ACCELERATION = math.radians(600.0)
 """Acceleration of the tilt in a dose [rad/s²]."""
 
+WATCHDOG = "; the program on the controller ends by its watchdog"
+"""What ends a motion whose connection was lost."""
+
 
 @dataclass(frozen=True, eq=False)
 class _Tilts:
@@ -422,7 +425,7 @@ class UrArm:
             clock = 0.0 if progress is None else progress.clock
             self._stops.lost()
             self._tilt, self._stopped = segment.tilt(clock), True
-            raise ArmLostError(f"{error}. {segment.last_seen(clock)}") from None
+            raise ArmLostError(f"{error}. {segment.last_seen(clock)}{WATCHDOG}") from None
         assert isinstance(outcome, MotionOutcome)
         return outcome
 
@@ -463,7 +466,7 @@ class UrArm:
         self._tilt, self._stopped = segment.tilt_left(outcome), True
         if outcome.kind == "lost":
             self._session.kill()
-            raise ArmLostError(f"{outcome.text}. {segment.last_seen(outcome.clock)}", executed)
+            raise ArmLostError(f"{outcome.text}. {segment.last_seen(outcome.clock)}{WATCHDOG}", executed)
         raise segment.stopped(outcome, executed)
 
 

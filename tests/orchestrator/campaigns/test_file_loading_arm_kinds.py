@@ -46,7 +46,7 @@ def test_what_is_wrong_with_a_kind_is_told_with_its_place(tmp_path):
     assert "7:13: arm.kind: 'simulatd' is not known here; did you mean 'simulated'?" in refusal(
         tmp_path, "arm: {kind: simulatd}\n"
     )
-    assert "7:24: arm.model: belongs to ur, not to simulated" in refusal(
+    assert "7:24: arm.model: belongs to franka and ur, not to simulated" in refusal(
         tmp_path, "arm: {kind: simulated, model: ur10}\n"
     )
     assert "a simulated arm stands nowhere" in refusal(

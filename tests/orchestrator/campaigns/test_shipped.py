@@ -45,11 +45,6 @@ def named(path: Path) -> str:
     return path.stem
 
 
-@pytest.mark.parametrize("path", CAMPAIGNS, ids=named)
-def test_shipped_campaign_can_start(path: Path) -> None:
-    assert check_campaign(load_campaign(path)) == []
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ur3e-kern", "ur5e-mettler", "ur10e-a-and-d"])
 def test_the_first_pours_fit_every_laboratory_of_hardware_also_with_a_calibrated_robot(name: str) -> None:

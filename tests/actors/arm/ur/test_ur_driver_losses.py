@@ -161,6 +161,7 @@ def test_killing_the_worker_in_mid_pour_stops_the_arm(make_rig: Make) -> None:
     error = lost(pouring)
     assert "died" in str(error)
     assert "tilted by" in str(error)
+    assert "the program on the controller ends by its watchdog" in str(error)
     stood_soon(rig, began, 1.5)
     goes_on_only_by_an_operator(rig)
 
