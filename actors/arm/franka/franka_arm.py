@@ -77,7 +77,7 @@ class FrankaRobot:
     def connect(self) -> ArmFacts:
         """See `JointRobot.connect`; starts a new worker."""
         self.close()
-        self._worker = ConnectedProcess("actors.arm.franka.franka_worker")
+        self._worker = ConnectedProcess("actors.arm.franka.franka_worker", prompt=True)
         facts: ArmFacts = self._ask("open", self._spec, deadline=OPEN_TIME)
         return facts
 
