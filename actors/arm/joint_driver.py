@@ -99,8 +99,8 @@ class JointReading:
     kind: str = "protective stop"
 
 
-class JointRobot(Protocol):
-    """What a robot does for `JointArm`. Every call raises ConnectionError if the robot cannot be reached."""
+class _Robot(Protocol):
+    """What `JointRobot` and `VelocityRobot` share. Every call raises ConnectionError if it cannot be reached."""
 
     def connect(self) -> ArmFacts:
         """Connect, again if it was connected before. Nothing moves."""
@@ -108,10 +108,6 @@ class JointRobot(Protocol):
 
     def read(self) -> JointReading:
         """The measured state; also during a motion."""
-        ...
-
-    def begin(self, path: JointPath) -> None:
-        """Begin to follow joints over time, linear in between, from where the robot stands; returns at once."""
         ...
 
     def halt(self) -> None:
@@ -123,8 +119,16 @@ class JointRobot(Protocol):
         ...
 
 
-class VelocityRobot(JointRobot, Protocol):
-    """A robot that takes joint speeds; see `VelocityArm`. Its `begin` is not used.
+class JointRobot(_Robot, Protocol):
+    """What a robot does for `JointArm`. Every call raises ConnectionError if the robot cannot be reached."""
+
+    def begin(self, path: JointPath) -> None:
+        """Begin to follow joints over time, linear in between, from where the robot stands; returns at once."""
+        ...
+
+
+class VelocityRobot(_Robot, Protocol):
+    """A robot that takes joint speeds; see `VelocityArm`.
 
     If it has a method `pours`, that is called before each motion: with the pour on whose path the cup is tilted, or
     with None. Such a robot brings the cup upright by itself once its driver is gone.
@@ -158,7 +162,7 @@ class JointArm:
         robot: makes the robot from the settings.
     """
 
-    def __init__(self, spec: JointArmSettings, robot: Callable[[Any], JointRobot]) -> None:
+    def __init__(self, spec: JointArmSettings, robot: Callable[[Any], JointRobot | VelocityRobot]) -> None:
         self._spec, self.robot = spec, robot(spec)
         self._working = threading.Lock()
         self._released_at: float | None = None
@@ -424,7 +428,7 @@ class JointArm:
             time.sleep(PERIOD)
 
     def _begin(self, path: JointPath) -> None:
-        self.robot.begin(path)
+        self.robot.begin(path)  # type: ignore[union-attr]  # `VelocityArm` overrides this
 
     def _steer(self, path: JointPath, reading: JointReading) -> None:
         """Called for each reading of a path."""

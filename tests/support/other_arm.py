@@ -22,7 +22,6 @@ from actors.arm.arm_settings import ARMS, History
 from actors.arm.joint_arm import ArmModel, JointArmSettings
 from actors.arm.joint_arm_kind import JointArmKind
 from actors.arm.joint_driver import JointReading, VelocityArm
-from actors.arm.planned_pour import JointPath
 from actors.arm.ur.robot_models import MODELS
 from actors.arm.ur.ur_kinematics import kinematics_of
 from actors.arm_geometry import JointAngles
@@ -121,9 +120,6 @@ class OtherRobot:
         if not self.cable.plugged:
             raise ConnectionError("the robot does not answer")
         return JointReading(moment, joints, "a protective stop: reset it at the robot" if self.cable.tripped else "")
-
-    def begin(self, path: JointPath) -> None:
-        raise NotImplementedError
 
     def turn(self, speeds: FloatArray, seconds: float) -> None:
         self.cable.turn(speeds, seconds)

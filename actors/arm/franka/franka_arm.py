@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from actors.arm.arm_interface import ArmFacts
 from actors.arm.joint_driver import JointReading
-from actors.arm.planned_pour import JointPath, PourPath
+from actors.arm.planned_pour import PourPath
 from actors.arm.urdf_chain import ChainArmSettings, ChainModel, chain_of
 from actors.runtime.bench_clock import device_clock
 from actors.runtime.child_process import ConnectedProcess
@@ -75,20 +75,16 @@ class FrankaRobot:
         return None if self._worker is None else self._worker.pid
 
     def connect(self) -> ArmFacts:
-        """See `JointRobot.connect`; starts a new worker."""
+        """See `VelocityRobot.connect`; starts a new worker."""
         self.close()
         self._worker = ConnectedProcess("actors.arm.franka.franka_worker", prompt=True)
         facts: ArmFacts = self._ask("open", self._spec, deadline=OPEN_TIME)
         return facts
 
     def read(self) -> JointReading:
-        """See `JointRobot.read`."""
+        """See `VelocityRobot.read`."""
         reading: JointReading = self._ask("read")
         return reading
-
-    def begin(self, path: JointPath) -> None:
-        """See `VelocityRobot`: not used."""
-        raise NotImplementedError
 
     def pours(self, path: PourPath | None) -> None:
         """State the pour under way, along which the worker brings the cup upright; None after its end."""
@@ -99,7 +95,7 @@ class FrankaRobot:
         self._ask("turn", speeds, seconds)
 
     def halt(self) -> None:
-        """See `JointRobot.halt`."""
+        """See `VelocityRobot.halt`."""
         self._ask("halt", deadline=3.0)
 
     def recover(self) -> str:
@@ -108,7 +104,7 @@ class FrankaRobot:
         return done
 
     def close(self) -> None:
-        """See `JointRobot.close`; waits until the worker has let go of the robot."""
+        """See `VelocityRobot.close`; waits until the worker has let go of the robot."""
         worker, self._worker = self._worker, None
         if worker is not None:
             worker.connection.close()
