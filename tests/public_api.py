@@ -69,7 +69,8 @@ def _class_line(name: str, cls: type) -> str:
 
 def _members(name: str, cls: type) -> list[str]:
     lines = []
-    for key, value in vars(cls).items():
+    shared = [base for base in cls.__mro__[1:] if base.__name__.startswith("_") and base.__module__ == cls.__module__]
+    for key, value in {k: v for owner in (*shared[::-1], cls) for k, v in vars(owner).items()}.items():
         if key.startswith("_"):
             continue
         if isinstance(value, property):
