@@ -1,13 +1,14 @@
 """Rows and pictures of a campaign's learning: losses and predictions, surrogates, θ, and the model check.
 
-`LearningStage` writes curves and pictures. `surrogate_picture`, `slices_picture` and `theta_picture` draw them, since
-Rerun has no plot type for these; `png` encodes them.
+`LearningStage` writes curves and pictures. `surrogate_picture` and `slices_picture` draw those of surrogates, since
+Rerun has no plot type for them; `png` encodes them. The posterior of θ is that of the report.
 """
 
 from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from actors.optimizer.questions import (
     SurrogateQuery,
 )
 from actors.optimizer.suggest import slices
-from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta
+from orchestrator.learning.calibration.calibration_base import Calibrated
 from orchestrator.learning.campaign_plan import CampaignPlan, receiver_names
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import Believed
@@ -46,11 +47,14 @@ from orchestrator.reports.loss_units import (
 )
 from orchestrator.reports.progress_state import Best
 from orchestrator.reports.summarise import pour_summary
+from orchestrator.reports.surrogate_figures import draw_posterior
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.outcome import PourMeasurement
 from sim_engine.prediction_band import LEVEL
+from sim_engine.search_space import Axis
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -163,11 +167,12 @@ class LearningStage:
 
     def learnt(self, result: StageResult, now: float) -> None:
         """Log the current result of a strategy."""
-        if isinstance(result, Calibrated) and result.found is not None:
-            theta = result.found
-            if theta.searched:
-                draw = f"{PLACE}/{CALIBRATION}/theta"
-                self._picture(draw, now, lambda: png(theta_picture(theta)))
+        if isinstance(result, Calibrated) and result.found is not None and self._plan.calibration is not None:
+            theta, space = result.found.theta.model_dump(), self._plan.calibration.parameters
+            draw = partial(words, f"θ*: {style.display_values({name: theta[name] for name in space.names})}")
+            if (posterior := result.found.posterior) is not None:
+                draw = partial(draw_posterior, posterior, space, theta)
+            self._picture(f"{PLACE}/{CALIBRATION}/theta", now, lambda: png(draw()))
         if isinstance(result, Deployed):
             place = f"{PLACE}/{safe_name(result.scene)}/trust"
             if isinstance(result.model_check, Believed):
@@ -257,7 +262,6 @@ def surrogate_picture(query: SurrogateQuery, suggestion: Suggestion, unit: LossU
     assert suggestion.surrogate is not None
     surrogate, space = suggestion.surrogate, query.space
     plane = surrogate.plane(space)
-    columns = [space.names.index(name) for name in plane.names]
     mean, deviation = (unit.factor * np.asarray(grid, float) for grid in (surrogate.mean, surrogate.deviation))
     bound = mean - query.kappa * deviation
     figure, axes = style.new_figure(1, 3, size=(15.0, 5.2), layout=None)
@@ -269,27 +273,13 @@ def surrogate_picture(query: SurrogateQuery, suggestion: Suggestion, unit: LossU
         (f"± σ [{unit.unit}]", deviation, "cividis"),
         (f"lower bound, mean − {query.kappa:g} σ [{unit.unit}]", bound, "viridis_r"),
     )
-    simulated = simulated_points(query)
     across, up = plane.axes
-    scales = [style.display_factor(axis.name) for axis in (across, up)]
-    places = np.linspace(0.0, 1.0, len(mean))
-    grid = [[axis.decode(u) / scale for u in places] for axis, scale in zip((across, up), scales, strict=True)]
     for panel, (name, values, colours) in zip(axes, panels, strict=True):
-        picture = panel.pcolormesh(*grid, values, shading="nearest", cmap=colours, zorder=0, rasterized=True)
-        bar = figure.colorbar(picture, ax=panel, pad=0.03, fraction=0.06)
+        mesh = _cut(panel, query, suggestion, plane.axes, values, cmap=colours)
+        bar = figure.colorbar(mesh, ax=panel, pad=0.03, fraction=0.06)
         bar.ax.tick_params(labelsize=13)
-        for points, look in (
-            (simulated, {"marker": "o", "s": 14, "facecolor": "none", "edgecolor": style.INK}),
-            (query.data.points, {"marker": "o", "s": 55, "facecolor": "white", "edgecolor": style.INK}),
-            (suggestion.points, {"marker": "*", "s": 330, "facecolor": style.BEST, "edgecolor": "white"}),
-        ):
-            if points:
-                xs, ys = _values(points, columns, plane.axes, scales)
-                panel.scatter(xs, ys, linewidth=1.2, zorder=4, **look)
         panel.set_title(name, fontsize=14, loc="left", color=style.INK)
         panel.set_xlabel(style.label(across.name), fontsize=14)
-        style.frame(panel, across, "x")
-        style.frame(panel, up, "y")
         panel.tick_params(labelsize=13, labelleft=panel is axes[0])
     axes[0].set_ylabel(style.label(up.name), fontsize=14)
     figure.text(0.955, 0.98, _key(query, suggestion), fontsize=14, color=style.INK, ha="right", va="top")
@@ -310,17 +300,11 @@ def slices_picture(query: SurrogateQuery, suggestion: Suggestion, unit: LossUnit
     if not names:
         return words(f"{title}: too little for slices")
     axis_of = dict(zip(query.space.names, query.space.axes, strict=True))
-    column_of = {name: query.space.names.index(name) for name in names}
     figure, axes = style.new_figure(len(names), len(names), size=(15.0, 9.0), squeeze=False)
     figure.suptitle(title, fontsize=17, color=style.INK, x=0.01, ha="left")
     means = [unit.factor * np.maximum(np.asarray(plane.mean, float), 0.0) for plane in maps]
     deviations = [unit.factor * np.asarray(plane.deviation, float) for plane in maps]
-    seen = (
-        (simulated_points(query), {"marker": "o", "s": 10, "facecolor": "none", "edgecolor": style.INK}),
-        (query.data.points, {"marker": "o", "s": 30, "facecolor": "white", "edgecolor": style.INK}),
-        (suggestion.points, {"marker": "*", "s": 200, "facecolor": style.BEST, "edgecolor": "white"}),
-    )
-    lines: dict[str, Any] = {}
+    meshes: dict[str, Any] = {}
     for plane, mean, deviation in zip(maps, means, deviations, strict=True):
         low, high = (names.index(name) for name in plane.axes)
         # Below the diagonal, the first axis is horizontal; above it, the panel is transposed.
@@ -329,17 +313,8 @@ def slices_picture(query: SurrogateQuery, suggestion: Suggestion, unit: LossUnit
             ("sd", (low, high), deviation.T, deviations, "cividis"),
         ):
             panel, across, up = axes[row, column], axis_of[names[column]], axis_of[names[row]]
-            places = np.linspace(0.0, 1.0, len(values))
-            scales = [style.display_factor(axis.name) for axis in (across, up)]
-            grid = [[axis.decode(u) / scale for u in places] for axis, scale in zip((across, up), scales, strict=True)]
             span = {"vmin": min(float(v.min()) for v in every), "vmax": max(float(v.max()) for v in every)}
-            lines[kind] = panel.pcolormesh(*grid, values, shading="nearest", cmap=colours, rasterized=True, **span)
-            for points, look in seen:
-                if points:
-                    places_of = [column_of[across.name], column_of[up.name]]
-                    panel.scatter(*_values(points, places_of, (across, up), scales), zorder=4, **look)
-            style.frame(panel, across, "x")
-            style.frame(panel, up, "y")
+            meshes[kind] = _cut(panel, query, suggestion, (across, up), values, 0.6, cmap=colours, **span)
             panel.tick_params(labelsize=12, labelbottom=row == len(names) - 1, labelleft=column == 0)
     for place, name in enumerate(names):
         axes[place, place].axis("off")
@@ -349,7 +324,7 @@ def slices_picture(query: SurrogateQuery, suggestion: Suggestion, unit: LossUnit
         if place < len(names) - 1:
             axes[-1, place].set_xlabel(style.label(name), fontsize=13)
     for kind, text in (("mean", f"below: expected {unit.label}"), ("sd", f"above: ± σ [{unit.unit}]")):
-        bar = figure.colorbar(lines[kind], ax=axes, pad=0.01, aspect=40)
+        bar = figure.colorbar(meshes[kind], ax=axes, pad=0.01, aspect=40)
         bar.set_label(text, fontsize=13)
         bar.ax.tick_params(labelsize=12)
     held = style.display_values(dict(query.space.decode(maps[0].at)))
@@ -370,32 +345,28 @@ def words(text: str) -> Figure:
     return figure
 
 
-def theta_picture(best: CalibratedTheta) -> Figure:
-    """Draw θ* and its posterior: one panel for each searched parameter."""
-    names = best.searched
-    figure, axes = style.new_figure(1, len(names), size=(5.0 * max(len(names), 2), 4.2), squeeze=False)
-    expected = f"expected |measured − simulated| {100 * max(best.predicted_discrepancy, 0.0):.1f} %"
-    figure.suptitle(f"θ*: {expected}", fontsize=17, color=style.INK, x=0.01, ha="left")
-    draws = () if best.posterior is None else best.posterior.thetas
-    chosen = best.theta.model_dump()
-    for panel, name in zip(axes[0], names, strict=True):
-        if draws:
-            panel.hist([theta[name] for theta in draws], bins=24, color=style.FALLING, density=True)
-        panel.axvline(chosen[name], color=style.BEST, linewidth=3.0)
-        title = f"{style.display_value(name, chosen[name])}"
-        panel.set_title(title, fontsize=15, loc="left", color=style.BEST)
-        panel.set_xlabel(style.label(name), fontsize=14)
-        panel.set_yticks([])
-        panel.tick_params(labelsize=13)
-    axes[0, 0].set_ylabel("how well it fits", fontsize=14)
-    return figure
-
-
-def _values(
-    points: Sequence[Sequence[float]], columns: list[int], axes: Any, scales: list[float]
-) -> tuple[list[float], list[float]]:
-    across, up = (
-        [axis.decode(point[column]) / scale for point in points]
-        for axis, column, scale in zip(axes, columns, scales, strict=True)
+def _cut(
+    panel: Axes, query: SurrogateQuery, suggestion: Suggestion, plane: Sequence[Axis], values: FloatArray,
+    size: float = 1.0, **colours: Any,
+) -> Any:  # fmt: skip
+    """Draw a map over two axes with simulations, observations and the next points; `size` is that of their marks."""
+    scales = [style.display_factor(axis.name) for axis in plane]
+    places = np.linspace(0.0, 1.0, len(values))
+    grid = [[axis.decode(u) / scale for u in places] for axis, scale in zip(plane, scales, strict=True)]
+    mesh = panel.pcolormesh(*grid, values, shading="nearest", zorder=0, rasterized=True, **colours)
+    columns = [query.space.names.index(axis.name) for axis in plane]
+    marks: tuple[tuple[Sequence[Point], float, dict[str, Any]], ...] = (
+        (simulated_points(query), 14, {"marker": "o", "facecolor": "none", "edgecolor": style.INK}),
+        (query.data.points, 55, {"marker": "o", "facecolor": "white", "edgecolor": style.INK}),
+        (suggestion.points, 330, {"marker": "*", "facecolor": style.BEST, "edgecolor": "white"}),
     )
-    return across, up
+    for points, area, look in marks:
+        if points:
+            xs, ys = (
+                [axis.decode(point[column]) / scale for point in points]
+                for axis, column, scale in zip(plane, columns, scales, strict=True)
+            )
+            panel.scatter(xs, ys, s=size * area, linewidth=1.2, zorder=4, **look)
+    style.frame(panel, plane[0], "x")
+    style.frame(panel, plane[1], "y")
+    return mesh

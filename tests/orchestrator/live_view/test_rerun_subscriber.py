@@ -22,7 +22,8 @@ from actors.runtime.child_process import child_environment
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.learning.requests import Pour, Simulate, Simulated, Suggest, Suggested
 from orchestrator.live_view.blueprints import Moment, campaign_blueprint
-from orchestrator.live_view.learning_view import slices_picture, surrogate_picture
+from orchestrator.live_view.learning_view import LearningStage, slices_picture, surrogate_picture
+from orchestrator.live_view.recording_sink import RecordingSink
 from orchestrator.live_view.rerun_subscriber import QueueThread, RerunMonitor
 from orchestrator.live_view.run_recording import CampaignRecording
 from orchestrator.live_view.simulation_view import simulation_rrd
@@ -31,7 +32,7 @@ from orchestrator.reports.loss_units import DISCREPANCY
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import RecordedFrames, SimulatedPour
 from sim_engine.search_space import Axis, Space
-from tests.support import example_run
+from tests.support import example_results, example_run
 from tests.support.rerun_recordings import Contents
 from tests.support.waiting import PATIENCE
 
@@ -94,6 +95,17 @@ def test_surrogates_of_calibration_and_receiver_are_in_the_recording_as_pictures
         pictures = recorded.values(f"/learning/{place}/surrogate", "EncodedImage:blob")
         assert len(pictures) == 1 + count, "first it is said that there will be one"
         assert bytes(pictures[0][0][:8]) == b"\x89PNG\r\n\x1a\n"  # type: ignore[index]
+
+
+def test_theta_of_a_calibration_is_in_the_recording_as_the_picture_of_its_posterior(tmp_path: Path) -> None:
+    calibrated = example_results.played_results()["calibration"]
+    path = tmp_path / "campaign.rrd"
+    sink = RecordingSink(path, application="decant", name="campaign")
+    LearningStage(sink, example_run.campaign()).learnt(calibrated, 0.0)
+    sink.close()
+    (picture,) = Contents(path).values("/learning/calibration/theta", "EncodedImage:blob")
+    (tmp_path / "theta.png").write_bytes(bytes(picture[0]))  # type: ignore[index]
+    assert example_results.is_picture(tmp_path / "theta.png")
 
 
 def test_picture_of_a_surrogate_has_axes_units_data_and_the_next_point() -> None:
