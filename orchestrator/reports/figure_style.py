@@ -88,6 +88,14 @@ def display_interval(name: str, low: float | None, high: float | None) -> str:
     return f"{display_value(name, low).removesuffix(unit).rstrip()} … {display_value(name, high)}"
 
 
+def two_digits(value: float) -> str:
+    """Two significant digits: '0.47', '5.2', '1 500'."""
+    if value < 100.0:
+        return f"{value:.2g}"
+    digits = 10 ** (len(str(int(value))) - 2)
+    return f"{round(value / digits) * digits:,}".replace(",", " ")
+
+
 def display_values(values: Mapping[str, float | None]) -> str:
     """Several named quantities in one line, from SI values: 'angular velocity 41.2 deg/s, x offset 104 mm'."""
     return ", ".join(f"{name.replace('_', ' ')} {display_value(name, value)}" for name, value in values.items())

@@ -17,7 +17,7 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from statistics import median
+from statistics import fmean, median
 
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.learning.calibration.calibration_scores import DRAWS
@@ -28,6 +28,7 @@ from orchestrator.learning.strategy import Progress, plural
 from orchestrator.records.events import CampaignOpened, Event, RequestFinished, RequestStarted, StageOpened
 from orchestrator.records.journal_file import Header
 from orchestrator.records.run_record import NOT_REPORTED, RunPour, RunState
+from orchestrator.reports.figure_style import two_digits
 from orchestrator.reports.loss_units import LossUnit, is_calibration, minimised_loss, unit_of_pour
 from orchestrator.reports.summarise import pour_summary
 from orchestrator.runs.stages import CALIBRATION, CONFIRMATION, DEPLOYMENT, DOSES, EVALUATION, POURS
@@ -73,7 +74,7 @@ class ProgressState:
         self.plan = plan
         self.run = RunState(Header(plan.name, {}), plan.parallel_simulations)
         self.forecast = Forecast(self.run, plan.parameters.particles)
-        self._timed: list[float] = []
+        self._cpu_s: list[float] = []
         self._busy_seconds, self._load_to = 0.0, 0.0
         self._load_from: float | None = None
 
@@ -81,8 +82,8 @@ class ProgressState:
         """Take an event."""
         if not event.replayed:
             self._pass_time(event.time)
-            if isinstance(event, RequestFinished) and isinstance(event.outcome, Simulated) and event.seconds > 0.0:
-                self._timed.append(event.seconds)
+            if isinstance(event, RequestFinished) and isinstance(event.outcome, Simulated):
+                self._cpu_s.append(event.outcome.outcome.cpu_s)  # what was made ahead has no wall time
         self.run.take(event)
         self.forecast(event)
         if isinstance(event, CampaignOpened):
@@ -135,7 +136,7 @@ class ProgressState:
     def counts_line(self, scene: str | None = None) -> str:
         """'214 simulations, 0.9 s each · best so far 1.10 % (pour 4)'."""
         run, pour = self.run, self.run.pour
-        each = f", {sum(self._timed) / len(self._timed):.1f} s each" if self._timed else ""
+        each = f", {two_digits(fmean(self._cpu_s))} s each" if self._cpu_s else ""
         parts = [f"{plural(run.simulated, 'simulation')}{each}"]
         calibrating = self.pour is not None and is_calibration(self.plan, self.pour.request)
         if run.ahead.waiting and (run.ahead.running or calibrating):  # some of them are never requested

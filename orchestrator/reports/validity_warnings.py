@@ -160,17 +160,9 @@ def numbers_line(validity: ModelValidity) -> str:
     parts = []
     for place, numbers in (("lip", validity.lip), ("stream", validity.stream)):
         ranges = (("Re", numbers.reynolds), ("We", numbers.weber), ("Bo", numbers.bond))
-        shown = (f"{name} {_number(r.smallest)} … {_number(r.largest)}" for name, r in ranges)
+        shown = (f"{name} {style.two_digits(r.smallest)} … {style.two_digits(r.largest)}" for name, r in ranges)
         parts.append(f"{place}: {', '.join(shown)}")
     return "; ".join(parts)
-
-
-def _number(value: float) -> str:
-    """Two significant digits: '0.47', '5.2', '1 500'."""
-    if value < 100.0:
-        return f"{value:.2g}"
-    digits = 10 ** (len(str(int(value))) - 2)
-    return f"{round(value / digits) * digits:,}".replace(",", " ")
 
 
 def _middle(calibration: CalibrationPlan, name: str, otherwise: float) -> float:

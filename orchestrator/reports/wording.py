@@ -409,7 +409,7 @@ def cost(record: RunState, occupancy: Mapping[str, PoolUse], time_scale: float |
         pace = " (this bench waits for nothing)" if time_scale == 0.0 else pace
         costs["of it pouring"] = f"{minutes(sum(arm))}, {sum(arm) / len(arm):.1f} s a pour{pace}"
     if record.simulations:
-        each = f", {record.cpu_s / record.simulations:.1f} s each" if record.cpu_s else ""
+        each = f", {style.two_digits(record.cpu_s / record.simulations)} s each" if record.cpu_s else ""
         costs["simulations"] = f"{record.simulations}, {minutes(record.cpu_s)} of CPU time{each}"
     pools = {f"pool during pours, {stage.rpartition(':')[2]}": use.text for stage, use in occupancy.items()}
     return costs | {name: text for name, text in pools.items() if text}

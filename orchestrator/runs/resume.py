@@ -142,7 +142,7 @@ def replay(strategy: Strategy, history: StageHistory, stage: str) -> dict[int, R
         requests = strategy.ask(Slots(step.simulations, step.pours))
         for key, request in zip(step.ids, requests, strict=False):
             _check_same(history.requests[key], request, key, stage)
-            undelivered[key] = request
+            undelivered[key] = history.requests[key] = request
         if len(requests) != len(step.ids):
             raise RunError(
                 f"stage {stage}: the journal has {len(step.ids)} request(s) from {step.ids[:1] or 'none'} on, "
@@ -171,6 +171,8 @@ _ADVICE = (
 
 def _check_same(written: Request, now: Request, key: int, stage: str) -> None:
     # Decoded and encoded again: a later field with a default that changes nothing does not make a request different.
+    if isinstance(written, Pour) and isinstance(now, Pour):
+        written = replace(written, number=now.number)  # programs before 0.3.0 did not number refused pours
     before, after = encode_request(written), encode_request(now)
     if canonical(before) != canonical(after):
         raise RunError(

@@ -5,6 +5,7 @@ processes.
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -74,6 +75,18 @@ def test_what_was_told_is_what_the_campaign_learns_from(tmp_path: Path) -> None:
     run.save_tables()
     units = pd.read_parquet(run.directory / "tables" / "pours.parquet").attrs["units"]
     assert (units["angular_velocity_deg_s"], units["spilled_g"], units["seconds"]) == ("deg/s", "g", "s")
+
+
+@pytest.mark.slow
+def test_the_recipe_for_a_robot_of_ones_own_learns_where_it_pours_best(tmp_path: Path) -> None:
+    recipe = ROOT / "docs" / "recipes" / "own_robot.py"
+    ended = subprocess.run(
+        [sys.executable, recipe, tmp_path / "run"], timeout=PATIENCE, check=False, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stderr
+    (offset,) = re.findall(r"'x_offset_mm': ([\d.]+)", ended.stdout)
+    assert abs(float(offset) - 110.0) < 5.0
 
 
 @pytest.mark.slow
