@@ -20,7 +20,7 @@ from sim_engine.errors import InvalidSceneError
 from sim_engine.fluid.scene_setup import POSE_STEP
 from sim_engine.outcome import ESCAPED_LIMIT, ParticleState
 from sim_engine.scene import PourTask, SampledMotion
-from sim_engine.simulator import FALL, SLICE, PourSimulator, calm_until, is_near_lip
+from sim_engine.simulator import FALL, SLICE, PourSimulator, calm_until, is_near_lip, with_mirror_image
 
 if TYPE_CHECKING:
     from sim_engine.fluid.engine import FluidEngine
@@ -33,6 +33,10 @@ LIVE_SLICE = SLICE / 4.0
 BEHIND = 5e-3
 """Time by which the liquid stays behind the last pose [s]: the longest step of the solver and one row of its table of
 poses, so that no step needs a pose that is not known yet."""
+
+IN_PLANE = 1e-4
+"""Largest displacement [m] and turn [parts of a quaternion] out of the plane of symmetry that do not count. An arm that
+turns a vessel in this plane is within a tenth of it."""
 
 LONGEST = 120.0
 """Longest live pour [s]; its table of poses takes 3 MB."""
@@ -64,7 +68,8 @@ class LivePour:
         simulator: of this process; its vessels are used.
         task: scene, placement, θ and seed; `motion` and `frame_rate` are ignored.
         pose: of the pourer at time 0, in the scene's frame (7,): x y z [m], qw qx qy qz.
-        mirrored: whether only the half y ≥ 0 is simulated; the pourer then moves in the plane of symmetry.
+        mirrored: whether only the half y ≥ 0 is simulated; the pourer then moves in the plane of symmetry, as far as
+            `IN_PLANE`.
 
     Raises:
         InvalidSceneError: the liquid does not fit, or something of the task cannot be simulated live.
@@ -77,7 +82,7 @@ class LivePour:
                 "that is decided while it runs: set lip_adhesion to 0"
             )
         self._simulator, self._task, self._mirrored = simulator, task, mirrored
-        self._times, self._poses = np.zeros(1), np.asarray(pose, dtype=float).reshape(1, 7)
+        self._times, self._poses = np.zeros(1), self._possible(pose)
         self._highest, self._seen = -np.inf, 0  # of the tilts at multiples of SLICE, and their number
         self._fluid: FluidEngine | None = None
         self._load = self._slices = 0
@@ -93,9 +98,7 @@ class LivePour:
             ValueError: the times do not increase or are later than `LONGEST`, or a mirrored pourer left its plane.
             RuntimeError: another pour was simulated in this process meanwhile.
         """
-        poses = np.asarray(poses, dtype=float).reshape(-1, 7)
-        if self._mirrored and poses[:, [1, 4, 6]].any():
-            raise ValueError("a mirrored pourer moves in its plane of symmetry: y, qx and qz are 0")
+        poses = self._possible(poses)
         before = self._times[-1]
         self._times, self._poses = np.append(self._times, times), np.concatenate([self._poses, poses])
         motion = SampledMotion(self._times, self._poses)
@@ -130,13 +133,24 @@ class LivePour:
         return LiveState(self._engine.time(), in_pourer, in_flight, received, spilled, invalid)
 
     def particles(self) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Positions (N, 3) in the scene's frame [m] and states (N,) of the simulated particles."""
+        """Positions (N, 3) in the scene's frame [m] and states (N,) of all particles."""
         if self._fluid is None:
             end = float(self._times[-1])
             motion = SampledMotion(np.append(self._times, end + 1.0), np.append(self._poses, self._poses[-1:], axis=0))
             laid = self._simulator.laid(self._task, motion, end, self._mirrored)
-            return laid, np.full(len(laid), int(ParticleState.IN_POURER), np.uint8)
-        return self._engine.particles()
+            particles = laid, np.full(len(laid), int(ParticleState.IN_POURER), np.uint8)
+        else:
+            particles = self._engine.particles()
+        return with_mirror_image(*particles) if self._mirrored else particles
+
+    def _possible(self, poses: Floats) -> Floats:
+        poses = np.asarray(poses, dtype=float).reshape(-1, 7)
+        if not self._mirrored:
+            return poses
+        inside = in_plane(poses)
+        if inside is None:
+            raise ValueError("a mirrored pourer moves in its plane of symmetry: y, qx and qz are 0")
+        return inside
 
     @property
     def _engine(self) -> FluidEngine:
@@ -166,6 +180,16 @@ class LivePour:
         self._fluid, self._load, self._slices = fluid, fluid.loads, round(start / LIVE_SLICE)
 
 
+def in_plane(poses: Floats) -> Floats | None:
+    """Poses (T, 7), moved into the plane of symmetry; None if one of them is farther away than `IN_PLANE`."""
+    sideways = [1, 4, 6]  # y, and turns about x and z
+    if np.abs(poses[:, sideways]).max() > IN_PLANE:
+        return None
+    inside = poses.copy()
+    inside[:, sideways] = 0.0
+    return inside
+
+
 class LivePours(Protocol):
     """One pour after another; `actors.simulators.live_worker` has them in a process of its own."""
 
@@ -188,4 +212,4 @@ class LivePours(Protocol):
         ...
 
 
-__all__ = ["LIVE_SLICE", "LivePour", "LivePours", "LiveState"]
+__all__ = ["LIVE_SLICE", "LivePour", "LivePours", "LiveState", "in_plane"]

@@ -649,8 +649,12 @@ def recorded_frames(course: TimeLoop, motion: Motion) -> RecordedFrames | None:
     if not course.frames:
         return None
     times = np.array([t for t, _, _ in course.frames])
-    positions, states = [p for _, p, _ in course.frames], [s for _, _, s in course.frames]
-    if course.mirrored:
-        positions = [np.concatenate([p, p * np.array([1, -1, 1], np.float32)]) for p in positions]
-        states = [np.concatenate([s, s]) for s in states]
-    return RecordedFrames(times, positions, states, motion.sample(times))
+    frames = [with_mirror_image(p, s) if course.mirrored else (p, s) for _, p, s in course.frames]
+    return RecordedFrames(times, [p for p, _ in frames], [s for _, s in frames], motion.sample(times))
+
+
+def with_mirror_image(
+    positions: NDArray[np.float32], states: NDArray[np.uint8]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """All particles of a mirrored pour, from the positions (N, 3) and states (N,) of the simulated half."""
+    return np.concatenate([positions, positions * np.array([1, -1, 1], np.float32)]), np.concatenate([states, states])

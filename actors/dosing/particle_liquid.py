@@ -60,8 +60,8 @@ def dose_task(
     particles = round(theta.particles * content / scene.liquid.mass)
     liquid = scene.liquid.model_copy(update={"mass": content})
     theta = theta.model_copy(update={"particles": int(min(max(particles, info.lower), info.upper))})
-    whole = replace(scene, liquid=liquid, mirrored=None)  # real liquid is not its own mirror image
-    return PourTask(whole, action, theta, seed, pose_error=PoseError(x=error.x, y=error.y, z=error.z))
+    half = replace(scene, liquid=liquid, mirrored=True)  # if it may be: see `PourSimulator.mirrors`
+    return PourTask(half, action, theta, seed, pose_error=PoseError(x=error.x, y=error.y, z=error.z))
 
 
 def check_particles(scene: Scene, amount: float, theta: SimulationParameters) -> None:

@@ -21,7 +21,7 @@ from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import ConnectedProcess, last_lines
 from actors.simulators.job_runner import LONG_FIRST_JOB
 from sim_engine.errors import EngineError, InvalidSceneError
-from sim_engine.live_pour import LivePour, LiveState
+from sim_engine.live_pour import LivePour, LiveState, in_plane
 from sim_engine.scene import PourTask, SampledMotion
 from sim_engine.simulator import PourSimulator
 
@@ -99,8 +99,9 @@ class LocalLivePours:
         """See `LivePours.begin`."""
         if task.scene.liquid.is_thick not in self._compiled:
             self._compile(task)
-        still = SampledMotion(np.array([0.0, 1.0]), np.array([pose, pose]))
-        self._pour = LivePour(self._simulator, task, pose, mirrored=self._simulator.mirrors(task, still))
+        poses = in_plane(np.array([pose, pose]))
+        mirrored = poses is not None and self._simulator.mirrors(task, SampledMotion(np.array([0.0, 1.0]), poses))
+        self._pour = LivePour(self._simulator, task, pose, mirrored=mirrored)
 
     def _compile(self, task: PourTask) -> None:
         """Compile the kernels, or load them from the cache; like `JobRunner`, write those that were compiled."""

@@ -56,18 +56,19 @@ def test_the_liquid_is_bit_for_bit_that_of_the_motion_given_beforehand(
     assert whole.frames is not None
     assert whole.outcome.received > 0.05
     frames: dict[float, tuple[NDArray[np.float32], NDArray[np.uint8]]] = {}
-    pour = LivePour(simulator, TASK, motion.poses[0], mirrored=mirrored)
+    # the joints of an emulated arm leave the plane as little
+    aside = np.array([0.0, 7e-6, 0.0, 0.0, 7e-8, 0.0, 7e-8]) * mirrored
+    pour = LivePour(simulator, TASK, motion.poses[0] + aside, mirrored=mirrored)
     for first in range(1, len(motion.times)):  # several poses at once would leave out recorded moments
-        state = pour.advance(motion.times[first : first + 1], motion.poses[first : first + 1])
+        state = pour.advance(motion.times[first : first + 1], motion.poses[first : first + 1] - aside)
         frames[round(state.time, 9)] = pour.particles()
     state = pour.advance(motion.times[-1:] + 1.0, motion.poses[-1:])
     assert state.received == pytest.approx(SCENE.liquid.mass * whole.outcome.received, abs=0.01)
     compared = 0
     for time, positions, states in zip(whole.frames.times, whole.frames.positions, whole.frames.states, strict=True):
         if (alike := frames.get(round(float(time), 9))) is not None and ParticleState.IN_FLIGHT in states:
-            half = len(alike[0])
-            np.testing.assert_array_equal(alike[0], positions[:half])
-            np.testing.assert_array_equal(alike[1], states[:half])
+            np.testing.assert_array_equal(alike[0], positions)
+            np.testing.assert_array_equal(alike[1], states)
             compared += 1
     assert compared > 4
 

@@ -10,14 +10,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from actors.dosing.particle_liquid import dose_task
 from actors.interfaces import LaboratoryError
-from actors.simulators.live_worker import LivePourProcess
+from actors.simulators.live_worker import LivePourProcess, LocalLivePours
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.live_pour import LivePour
 from sim_engine.motion import recorded_motion
 from sim_engine.outcome import ParticleState
-from sim_engine.scene import PourTask, SampledMotion, Scene
+from sim_engine.scene import PoseError, PourTask, SampledMotion, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.vessel.shapes import cylinder
 
@@ -91,3 +92,18 @@ def test_an_impossible_pour_is_refused_and_the_process_goes_on(pours: LivePourPr
         pours.begin(replace(TASK, scene=replace(SCENE, liquid=Liquid(mass=0.9))), pose)
     pours.begin(TASK, pose)
     assert pours.advance(np.array([0.1]), pose).in_pourer == 0.3
+
+
+@pytest.mark.parametrize(
+    ("displacement", "shares"), [(0.0, 2), (1e-3, 1)], ids=["in the plane: mirrored", "1 mm aside: whole"]
+)
+def test_a_dose_is_simulated_by_half_where_its_receiver_stands_in_the_plane_of_the_tilt(
+    simulator: PourSimulator, displacement: float, shares: int
+) -> None:
+    task = dose_task(SCENE, ACTION, 0.3, SimulationParameters(particles=2000), PoseError(y=displacement), seed=1)
+    pours, pose = LocalLivePours(simulator), motion(simulator).poses[0]
+    pours.begin(task, pose + np.array([0.0, 7e-6, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    positions, _ = pours.particles()
+    assert len(positions) == 2000
+    image = positions[: 2000 // shares] * np.array([1.0, -1.0, 1.0], np.float32)
+    assert np.array_equal(positions[-2000 // shares :], image) is (shares == 2)
