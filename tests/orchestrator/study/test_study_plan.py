@@ -22,14 +22,29 @@ from tests.support.study_files import ROOT, STUDIES, read, small, without, writt
 def test_the_paper_study_has_the_repetitions_that_it_promises() -> None:
     cells = cells_of(load_study(STUDIES / "paper.yaml"))
     count = Counter((cell.kind, cell.strategy, cell.level) for cell in cells)
-    assert [count["calibration", strategy, "moderate"] for strategy in ("C1", "C2", "C3", "C4")] == [6, 3, 3, 6]
-    for level in ("small", "moderate", "large"):
+    assert [count["calibration", strategy, "searched"] for strategy in ("C1", "C2", "C3", "C4")] == [6, 3, 3, 6]
+    for level in ("searched", "moderate", "large"):
         assert count["pours", "", level] == 6
         for strategy in ("D1-uncalibrated", "D1-15", "D2", "D3"):
             assert count["deployment", strategy, level] == 3 * 6
-    spent = {strategy: sum(c.simulations - 32 for c in cells if c.strategy == strategy) for strategy in ("C2", "C3")}
+    spent = {strategy: sum(c.simulations - 40 for c in cells if c.strategy == strategy) for strategy in ("C2", "C3")}
     assert spent == {"C2": 3 * 504, "C3": 3 * 1652}
-    assert [c.simulations for c in cells if c.kind == "grid"] == [100 * 32]
+    assert [c.simulations for c in cells if c.kind == "grid"] == [100 * 40]
+
+
+def test_one_bench_of_the_paper_study_differs_from_the_simulator_in_what_is_searched_alone() -> None:
+    study = load_study(STUDIES / "paper.yaml")
+    bench, plan = study.level(study.compared).bench, study.calibration("C4").plan
+    default = study.base.parameters
+    assert bench is not None
+    differs = {name for name, value in bench.theta if value != getattr(default, name)}
+    assert differs == {axis.name for axis in plan.parameters.axes} == {"particles", "friction"}
+    assert bench.pose_error == type(bench.pose_error)(), "the receiver stands where the arm assumes it"
+    places = {
+        axis.name: abs(axis.encode(getattr(bench.theta, axis.name)) - axis.encode(getattr(default, axis.name)))
+        for axis in plan.parameters.axes
+    }
+    assert places == pytest.approx({"particles": 1 / 3, "friction": 1 / 3}, abs=0.01)
 
 
 def test_the_uncalibrated_baseline_plans_with_the_defaults_and_needs_no_calibration(tmp_path: Path) -> None:
