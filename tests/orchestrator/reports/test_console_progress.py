@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from orchestrator.learning.requests import Failed, Pour, Poured, Simulate
+from orchestrator.learning.requests import Failed, Pour, Poured, Simulate, Simulated
 from orchestrator.learning.strategy import Progress
 from orchestrator.records.events import (
     CampaignClosed,
@@ -52,7 +52,7 @@ def test_log_without_terminal_names_stages_pours_and_warnings_in_plain_lines() -
         in lines
     )
     assert "the balance drifts" in lines
-    assert lines[-1].startswith("campaign finished; 2 simulations, 2.0 s each")
+    assert lines[-1].startswith("campaign finished; 2 simulations, 0.9 s each")
     assert lines[-1].endswith("best so far 6.00 % (pour 3)")
 
 
@@ -116,7 +116,23 @@ def test_terminal_shows_bars_the_running_pours_checkpoint_and_the_pool() -> None
     assert "40 %" in text
     assert "tilt 30 deg" in text
     assert "balance 0.3 g" in text
-    assert "pool 0/2 busy · 2 simulations, 2.0 s each" in text
+    assert "pool 0/2 busy · 2 simulations, 0.9 s each" in text
+
+
+@pytest.mark.parametrize(
+    ("cpu_s", "shown"), [(0.031, "0.031 s each"), (0.9, "0.9 s each"), (12.4, "12 s each"), (312.0, "310 s each")]
+)
+def test_simulations_that_were_made_ahead_are_counted_with_their_own_time(cpu_s: float, shown: str) -> None:
+    """Their answers come at once, so that the wall time of their requests is nearly 0."""
+    plan = campaign()
+    progress = ProgressState(plan)
+    for event in events(plan):
+        ahead = event
+        if isinstance(event, RequestFinished) and isinstance(event.outcome, Simulated):
+            made = Simulated(replace(event.outcome.outcome, cpu_s=cpu_s))
+            ahead = replace(event, outcome=made, seconds=0.0002)
+        progress(ahead)
+    assert f"2 simulations, {shown}" in progress.counts_line()
 
 
 def test_display_writes_nothing_to_stdout(capsys: pytest.CaptureFixture[str]) -> None:

@@ -225,6 +225,27 @@ def test_a_strategy_that_has_changed_is_found_out_at_its_first_other_request(tmp
     assert run(directory, resume=True).state == "finished"  # nothing was lost by trying
 
 
+class Renumbered(ToyStrategy):
+    """The same strategy, which counts a refused pour: pours after it have other numbers than in an earlier journal."""
+
+    def ask(self, slots: Any) -> list[Any]:
+        return [replace(r, number=r.number + 1) if isinstance(r, Pour) else r for r in super().ask(slots)]
+
+
+def test_a_journal_that_does_not_number_refused_pours_is_resumed(tmp_path: Path) -> None:
+    directory = tmp_path / "run"
+    assert killed_at(60, after_commit=True, directory=directory)
+    begun = [pour.request.number for pour in read_record(directory).pours]
+    renumbered = (
+        StageDefinition("first", lambda results, seed: Renumbered(seed, simulations=3, pours=2, beside=2), pours=True),
+        SMALL[1],
+    )
+    assert run(directory, resume=True, stages=renumbered).state == "finished"
+    numbers = [pour.request.number for pour in read_record(directory).pours]
+    assert begun
+    assert numbers[: len(begun)] == begun, "what is written stays"
+
+
 def test_other_settings_can_not_continue_a_run_but_the_machine_may_be_another(tmp_path: Path) -> None:
     directory = tmp_path / "run"
     assert killed_at(30, after_commit=True, directory=directory)
