@@ -310,6 +310,9 @@ class JointArm:
     _longest_gap = math.inf
     """Longest time between two readings of a motion that does not end it [s of the robot's clock]."""
 
+    _after_loss = "The robot may go on to the end of its motion"
+    """What a robot does whose driver can't reach it."""
+
     @property
     def _ordered(self) -> int:
         """Number of stops that were ordered since the motion began."""
@@ -330,7 +333,7 @@ class JointArm:
             raise
         except ConnectionError as error:
             self._lock()
-            raise ArmLostError(f"{error}. The robot stops by itself; look at it") from error
+            raise ArmLostError(f"{error}. {self._after_loss}; look at it") from error
         except LaboratoryError:
             self._lock()
             raise
@@ -525,6 +528,7 @@ class VelocityArm(JointArm):
         self._dose: _Dose | None = None
 
     _longest_gap = 0.2
+    _after_loss = "The robot stops by itself"
 
     @property
     def _turns_back(self) -> bool:
