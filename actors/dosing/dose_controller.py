@@ -272,6 +272,7 @@ class DoseController:
         step: of the balance's display [kg].
         noise: standard deviation of a reading besides the display's step [kg].
         seed: of all randomness; the same inputs and seed give the same decisions.
+        in_time: each command follows the one before in time, as in a prediction. None says how long the arm may wait.
 
     Attributes:
         phase: now.
@@ -289,8 +290,9 @@ class DoseController:
         step: float = 1e-4,
         noise: float = 3e-5,
         seed: int = 0,
+        in_time: bool = False,
     ) -> None:
-        self._cup, self._order, self._settings = cup, order, settings
+        self._cup, self._order, self._settings, self._in_time = cup, order, settings, in_time
         self._estimator = DoseEstimator(
             cup, belief, fall_time=fall_time, step=step, noise=noise, rng=np.random.default_rng((seed, 5))
         )
@@ -407,7 +409,8 @@ class DoseController:
         e, s = self._estimator, self._settings
         factor, more = LATE_COMMAND
         least = min(factor * self._arm.tick + more, NEWS_TIMEOUT)
-        if self._order.amount - float(e.mass.max()) > 2.5 * self._cup.density * float(e.flow.max()) + 3e-3:
+        far = self._order.amount - float(e.mass.max()) > 2.5 * self._cup.density * float(e.flow.max()) + 3e-3
+        if far or self._in_time:
             return NEWS_TIMEOUT
         for patience in np.linspace(NEWS_TIMEOUT, least, 4)[:-1]:
             final = e.final_mass(

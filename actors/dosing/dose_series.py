@@ -187,7 +187,9 @@ class DoseSeries:
                 rng=np.random.default_rng((seed, 24, k)),
             )
             draws = widened.display.draws(np.random.default_rng((seed, 25, k)))
-            result, duration = self._simulate(self._controller(order, widened, seed + k), truth, order, draws)
+            result, duration = self._simulate(
+                self._controller(order, widened, seed + k, in_time=True), truth, order, draws
+            )
             amounts.append(float(truth.mass[0]))
             durations.append(duration)
             ends[result.end] += 1
@@ -231,9 +233,16 @@ class DoseSeries:
                 readings = [DoseReading(TICK * ticks, shown)]
         return controller.result, TICK * ticks
 
-    def _controller(self, order: DoseOrder, belief: DoseBelief, seed: int) -> DoseController:
+    def _controller(self, order: DoseOrder, belief: DoseBelief, seed: int, *, in_time: bool = False) -> DoseController:
         return DoseController(
-            self._cup, order, belief, self._settings, fall_time=self._fall_time, step=self._step, seed=seed
+            self._cup,
+            order,
+            belief,
+            self._settings,
+            fall_time=self._fall_time,
+            step=self._step,
+            seed=seed,
+            in_time=in_time,
         )
 
     def _volumes(self, content: SourceContent) -> tuple[float, float]:
