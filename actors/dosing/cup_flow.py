@@ -15,6 +15,7 @@ and a flow factor stand for them (`actors.dosing.dose_estimator`).
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -23,7 +24,9 @@ from numpy.typing import NDArray
 from sim_engine.hydrostatics import DISCHARGE, GRAVITY, level_table
 from sim_engine.liquids import Liquid
 from sim_engine.model_validity import DRIBBLING_WEBER
-from sim_engine.vessel.vessel import Vessel
+from sim_engine.scene import Scene
+from sim_engine.vessel.shapes import VesselSpec
+from sim_engine.vessel.vessel import Vessel, build_vessel
 
 Floats = NDArray[np.float64]
 
@@ -158,6 +161,16 @@ class CupFlow:
         flow[0] = 0.0
         increasing: Floats = np.maximum.accumulate(flow) + 1e-15 * np.arange(len(flow))
         return increasing
+
+
+@functools.lru_cache(maxsize=32)
+def _tabulated(pourer: VesselSpec, liquid: Liquid) -> CupFlow:
+    return CupFlow(build_vessel(pourer), liquid)
+
+
+def flow_of(scene: Scene) -> CupFlow:
+    """The flow out of a scene's pourer, computed once for each vessel and liquid, whatever its mass."""
+    return _tabulated(scene.pourer, scene.liquid.model_copy(update={"mass": 1.0}))
 
 
 def _opening(vessel: Vessel) -> tuple[Floats, Floats]:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from actors.dosing.cup_flow import CupFlow
+from actors.dosing.cup_flow import CupFlow, flow_of
 from actors.dosing.display_belief import IDEAL_DISPLAY, DisplayBelief
 from actors.dosing.dose_controller import (
     DoseController,
@@ -325,9 +325,10 @@ def series_of(
         placed, rng, step, display: see `DoseSeries`.
     """
     source = source_of(scene, dose)
-    cup = CupFlow(build_vessel(scene.pourer), scene.liquid)
     content = SourceContent(source.mass, source.deviation)
-    return DoseSeries(cup, settings, content, placed, rng, step=step, knowledge=source.knowledge, display=display)
+    return DoseSeries(
+        flow_of(scene), settings, content, placed, rng, step=step, knowledge=source.knowledge, display=display
+    )
 
 
 def unknown_amount(result: DoseResult) -> str:

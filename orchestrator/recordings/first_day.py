@@ -19,6 +19,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from actors.balance.display_behaviour import DisplayBehaviour
+from actors.dosing.cup_flow import flow_of
 from actors.dosing.dose_controller import DoseOrder
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, SourceContent
@@ -26,7 +27,6 @@ from actors.dosing.tilt_command import TiltCommand
 from actors.dosing.virtual_dosing_bench import DosingFault, TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
 from orchestrator.recordings.recording_file import PourRecording, load_recording, write_recording
-from orchestrator.recordings.recording_replay import flow_of
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.hydrostatics import retained_volume
 from sim_engine.liquids import Liquid

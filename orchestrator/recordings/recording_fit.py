@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from actors.dosing.cup_flow import flow_of
 from actors.dosing.dose_estimator import FACTOR_RANGE, LAG_RANGE, ONSET, SHAPE_RANGE, draw_lags
 from actors.dosing.pour_response import PourHypotheses, respond
 from orchestrator.recordings.recording_file import PourRecording
@@ -40,7 +41,6 @@ from orchestrator.recordings.recording_replay import (
     SEEN,
     Onset,
     ReplayValues,
-    flow_of,
     onset_of,
     time_of_fall,
 )

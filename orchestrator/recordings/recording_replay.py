@@ -11,7 +11,6 @@ simulation's readings have the lag that the estimator found in the same recordin
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.dosing.cup_flow import CupFlow
+from actors.dosing.cup_flow import flow_of
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, draw_lags
 from actors.dosing.pour_response import displayed, fall_time
 from orchestrator.recordings.recording_file import PourRecording
@@ -169,22 +168,6 @@ def _while_it_flows(recording: PourRecording) -> tuple[Floats, Floats]:
     high = np.flatnonzero(tilts > tilts.max() - TURNED_BACK)
     end = int(np.searchsorted(times, times[high[-1]] + AFTERWARDS)) + 1
     return times[: max(end, 2)], tilts[: max(end, 2)]
-
-
-@functools.lru_cache(maxsize=32)
-def cup_flow(pourer: VesselSpec, liquid: Liquid) -> CupFlow:
-    """The flow of a vessel.
-
-    Args:
-        pourer: the vessel.
-        liquid: its mass has no influence.
-    """
-    return CupFlow(build_vessel(pourer), liquid)
-
-
-def flow_of(scene: Scene) -> CupFlow:
-    """The flow of a scene's pourer, computed once for each vessel and liquid."""
-    return cup_flow(scene.pourer, scene.liquid.model_copy(update={"mass": 1.0}))
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,12 +29,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betaln, logsumexp, xlog1py, xlogy
 
+from actors.dosing.cup_flow import flow_of
 from actors.dosing.dose_estimator import LAG_RANGE, SHAPE_RANGE
 from actors.dosing.pour_response import displayed
 from orchestrator.recordings.first_day import MISS
 from orchestrator.recordings.recording_file import PourRecording
 from orchestrator.recordings.recording_fit import SHAPE, UNKNOWNS, FittedReadings, Unknown, held_share, lag_before
-from orchestrator.recordings.recording_replay import QUANTILE, flow_of
+from orchestrator.recordings.recording_replay import QUANTILE
 from orchestrator.recordings.time_series import arrivals
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import Liquid

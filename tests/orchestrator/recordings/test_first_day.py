@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from actors.dosing.cup_flow import flow_of
 from actors.dosing.pour_response import PourHypotheses, fall_time, respond
 from orchestrator.campaigns.shipped import shipped
 from orchestrator.cli.app import app
@@ -19,7 +20,6 @@ from orchestrator.recordings import first_day as protocol
 from orchestrator.recordings import rig_diagnosis
 from orchestrator.recordings.first_day import first_day, practice_day
 from orchestrator.recordings.recording_file import PourRecording, load_recordings, write_recording
-from orchestrator.recordings.recording_replay import flow_of
 from orchestrator.recordings.rig_diagnosis import diagnose
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import Liquid
