@@ -149,7 +149,7 @@ def _flow() -> Any:
     return cup_flows()(CUP, False)
 
 
-def pour_series(name: str, seed: int) -> list[Poured]:
+def loss_series(name: str, seed: int) -> list[Poured]:
     """Pour one series of a row."""
     return list(_doses(DISPLAYS[name], seed))
 
@@ -243,7 +243,7 @@ def main() -> None:
     seeds = range(first, first + options.series)
     with ProcessPoolExecutor(options.workers) as pool:
         for name in names:
-            found = figures([one for poured in pool.map(pour_series, [name] * len(seeds), seeds) for one in poured])
+            found = figures([one for poured in pool.map(loss_series, [name] * len(seeds), seeds) for one in poured])
             print(f"{name}: {json.dumps(found)}", flush=True)
             if options.json:
                 # the first measurement stays: with what is measured after a change it is a comparison

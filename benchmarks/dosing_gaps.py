@@ -176,7 +176,7 @@ def _flows() -> Any:
     return cup_flows()
 
 
-def pour_series(of: str, seed: int) -> list[Poured]:
+def loss_series(of: str, seed: int) -> list[Poured]:
     """Pour one series of a row."""
     return list(_doses(of, seed))
 
@@ -327,7 +327,7 @@ def main() -> None:
         _flow(*source)
     with ProcessPoolExecutor(options.workers) as pool:
         for of in options.rows:
-            doses = [one for poured in pool.map(pour_series, [of] * len(seeds), seeds) for one in poured]
+            doses = [one for poured in pool.map(loss_series, [of] * len(seeds), seeds) for one in poured]
             found = figures(doses)
             print(f"{of}: {json.dumps(found)}", flush=True)
             for one in sorted(doses, key=lambda one: -one.error)[: options.worst]:

@@ -135,7 +135,7 @@ def _spec(name: str) -> VesselSpec:
     return load_vessel(ROOT / "configs" / "vessels" / f"{name}.yaml")
 
 
-def pour_series(name: str, seed: int) -> list[Dose]:
+def loss_series(name: str, seed: int) -> list[Dose]:
     """Pour the doses of one series of a row."""
     row, rng, simulator = ROWS[name], np.random.default_rng((seed, 13)), _simulator()
     spec, own = _spec(row.source), np.random.default_rng((seed, 3))
@@ -231,7 +231,7 @@ def main() -> None:
     seeds = range(first, first + options.series)
     with ProcessPoolExecutor(options.workers) as pool:
         for name in options.rows:
-            doses = [dose for poured in pool.map(pour_series, [name] * len(seeds), seeds) for dose in poured]
+            doses = [dose for poured in pool.map(loss_series, [name] * len(seeds), seeds) for dose in poured]
             for dose in doses:
                 print(f"  {dose}", flush=True)
             found = figures(doses)

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from actors.balance.weighing_plan import Placement, PourMasses, measurement, weighing_uncertainty
+from actors.balance.weighing_plan import Placement, Weighing, measurement, weighing_uncertainty
 from actors.interfaces import DoseSource, DoseTarget
 from orchestrator.catalogue.catalogue import Catalogue
 from orchestrator.learning.requests import Pour, Poured, Prediction
@@ -91,10 +91,10 @@ class Bench:
     gripper: float = 0.0
     film: float = 0.0
 
-    def weighed(self, mass: float) -> PourMasses:
+    def weighed(self, mass: float) -> Weighing:
         """A reading of the balance."""
         shown = (1.0 - self.balance) * mass + self.rng.normal(0.0, REPEATABILITY)
-        return PourMasses(round(shown / STEP) * STEP, weighing_uncertainty(STEP, REPEATABILITY))
+        return Weighing(round(shown / STEP) * STEP, weighing_uncertainty(STEP, REPEATABILITY))
 
     def pours(self) -> Iterator[tuple[Pour, PourMeasurement]]:
         """The pours of one day, weighed below the receiver."""

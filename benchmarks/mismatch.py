@@ -83,7 +83,7 @@ from orchestrator.learning.campaign_plan import DeploymentPlan
 from orchestrator.learning.deployment import deployment_base
 from orchestrator.learning.deployment.d2 import D2Settings
 from orchestrator.learning.deployment.d3 import D3Settings
-from orchestrator.learning.deployment.real_pours import PourTrial, scaled_interval
+from orchestrator.learning.deployment.real_pours import DeploymentTrial, scaled_interval
 from orchestrator.learning.requests import Outcome, Prediction, Request
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
@@ -147,7 +147,7 @@ def campaign(arm: str, level: str, seed: int, pours: int, simulations: int, sett
         ]
         return of_surrogate(process, points, level)
 
-    def scale(prediction: Prediction, earlier: Sequence[PourTrial], worst: float) -> tuple[float, float]:
+    def scale(prediction: Prediction, earlier: Sequence[DeploymentTrial], worst: float) -> tuple[float, float]:
         unscaled.append(list(latest))
         scaled.append([scaled_interval(replace(prediction, band=band), earlier, worst) for band in latest])
         return scaled_interval(prediction, earlier, worst)

@@ -65,7 +65,7 @@ from orchestrator.learning.calibration.calibration_scores import CalibrationEval
 from orchestrator.learning.calibration.pour_design import stratified
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, MeasuredPour
 from orchestrator.learning.deployment import deployment_base
-from orchestrator.learning.deployment.real_pours import PourTrial, scaled_interval
+from orchestrator.learning.deployment.real_pours import DeploymentTrial, scaled_interval
 from orchestrator.learning.requests import Prediction
 from orchestrator.records.codec import digest, from_json, result_of, to_json
 from orchestrator.runs.stages import (
@@ -142,7 +142,7 @@ def one(seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: 
     pool = kept_pours(seed, into)
     unscaled: list[tuple[float, float]] = []
 
-    def scale(prediction: Prediction, earlier: Sequence[PourTrial], worst: float) -> tuple[float, float]:
+    def scale(prediction: Prediction, earlier: Sequence[DeploymentTrial], worst: float) -> tuple[float, float]:
         unscaled.append(prediction.of_a_pour())
         return scaled_interval(prediction, earlier, worst)
 

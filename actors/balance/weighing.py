@@ -22,7 +22,7 @@ from actors.balance.balance_settings import BalanceSettings
 from actors.balance.readings import typed_weight
 from actors.balance.weighing_plan import (
     SURE,
-    PourMasses,
+    Weighing,
     WeighingStep,
     loaded_mass,
     measurement,
@@ -59,27 +59,27 @@ class Weighings:
         spec: BalanceSettings,
         balance: DeviceBalance | None,
         ask: AskOperator,
-        known: Mapping[str, PourMasses] | None = None,
-        weighed: Callable[[str, PourMasses], None] = lambda key, weight: None,
+        known: Mapping[str, Weighing] | None = None,
+        weighed: Callable[[str, Weighing], None] = lambda key, weight: None,
         nominal: float | None = None,
     ) -> None:
         self._spec, self._balance, self._ask, self._notify, self._nominal = spec, balance, ask, weighed, nominal
         self._known = dict(known or {})
         self._steps = weighings(spec.position, known=self._known, pourer_elsewhere=spec.pourer == "elsewhere")
-        self._weighed: dict[str, PourMasses] = {}
+        self._weighed: dict[str, Weighing] = {}
 
     @property
-    def lasting(self) -> dict[str, PourMasses]:
+    def lasting(self) -> dict[str, Weighing]:
         """Weighings that remain valid for later pours with the same vessels."""
         once = {step.key: self._weighed[step.key] for step in self._steps if self._lasts(step)}
         return self._known | once
 
     @property
-    def weighed(self) -> dict[str, PourMasses]:
+    def weighed(self) -> dict[str, Weighing]:
         """All weighings so far, including valid ones of earlier pours."""
         return self._known | self._weighed
 
-    async def before(self, masses: Mapping[str, PourMasses] | None = None) -> None:
+    async def before(self, masses: Mapping[str, Weighing] | None = None) -> None:
         """Carry out all steps before the pour.
 
         Args:
@@ -191,13 +191,13 @@ class Weighings:
             f"loaded: {least:g} to {most:g} g are possible. Read it again; type the same text to keep it"
         )
 
-    def _note(self, key: str, weighed: PourMasses) -> None:
+    def _note(self, key: str, weighed: Weighing) -> None:
         self._weighed[key] = weighed
         self._notify(key, weighed)
 
-    def _typed(self, answer: str) -> PourMasses:
+    def _typed(self, answer: str) -> Weighing:
         typed = typed_weight(answer)
-        return PourMasses(typed.mass, weighing_uncertainty(typed.step, self._repeatability, tared=False))
+        return Weighing(typed.mass, weighing_uncertainty(typed.step, self._repeatability, tared=False))
 
     async def _read(self, step: WeighingStep) -> None:
         """Tare or weigh on the connected balance."""
@@ -220,7 +220,7 @@ class Weighings:
                 raise
             await self._balance.keep_reference()
             weight = await self._balance.weigh()
-        self._note(step.key, PourMasses(weight.mass, weighing_uncertainty(weight.step, self._repeatability)))
+        self._note(step.key, Weighing(weight.mass, weighing_uncertainty(weight.step, self._repeatability)))
 
     @property
     def _repeatability(self) -> float:

@@ -223,7 +223,7 @@ SURE = 4.0
 
 
 @dataclass(frozen=True)
-class PourMasses:
+class Weighing:
     """One weighing.
 
     Attributes:
@@ -235,14 +235,14 @@ class PourMasses:
     uncertainty: float = 0.0
 
 
-def loaded_mass(placement: Placement, weighed: Mapping[str, PourMasses]) -> float:
+def loaded_mass(placement: Placement, weighed: Mapping[str, Weighing]) -> float:
     """Loaded mass [kg] from the weighings before the pour."""
     return sum(c * weighed[key].mass for key, c in PLANS[placement].masses["loaded"].items())
 
 
 def measurement(
     placement: Placement,
-    weighed: Mapping[str, PourMasses],
+    weighed: Mapping[str, Weighing],
     *,
     nominal: float | None = None,
     tolerance: float = math.inf,
@@ -305,11 +305,11 @@ def _difference(table: Mapping[str, Mapping[str, float]]) -> Mapping[str, float]
     return {key: c for key, c in total.items() if c != 0.0}
 
 
-def _sigma(row: Mapping[str, float], weighed: Mapping[str, PourMasses]) -> float:
+def _sigma(row: Mapping[str, float], weighed: Mapping[str, Weighing]) -> float:
     return math.sqrt(sum((c * weighed[key].uncertainty) ** 2 for key, c in row.items()))
 
 
-def _check_complete(placement: Placement, weighed: Mapping[str, PourMasses]) -> None:
+def _check_complete(placement: Placement, weighed: Mapping[str, Weighing]) -> None:
     prompts = {step.key: step.put for step in PLANS[placement].steps if step.key}
     missing = [key for key in prompts if key not in weighed]
     if missing:

@@ -19,7 +19,7 @@ from actors.arm.pour_feasibility import path_of
 from actors.arm.simulated_arm import SimulatedArmSettings
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceSettings, balance_kind
-from actors.balance.weighing_plan import Placement, PourMasses
+from actors.balance.weighing_plan import Placement, Weighing
 from actors.bench.bench_operators import BenchContents, Hands, OperatorQuestions, PlayedOperator, VirtualOperator
 from actors.bench.cell_liquids import CellLiquids
 from actors.bench.consent import Setup
@@ -68,7 +68,7 @@ class PouringBench:
         self._setup, self._arm_spec, self._dosing = setup, setup.spec, dosing
         self.arm, self.balance, self.ground_truth = setup.arm, setup.balance, setup.ground_truth
         self._watch = setup.watch
-        self._known: dict[str, dict[str, PourMasses]] = {}
+        self._known: dict[str, dict[str, Weighing]] = {}
         self._one_at_a_time = asyncio.Lock()
 
     @property

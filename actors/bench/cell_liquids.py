@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from actors.balance.weighing_plan import SURE, PourMasses
+from actors.balance.weighing_plan import SURE, Weighing
 from actors.bench.vessel_carrying import MotionConsent, VesselCarrier
 from actors.interfaces import OperatorQuestion
 from actors.places import PlaceRecord
@@ -97,7 +97,7 @@ class CellLiquids:
             problem = "the account has not enough for it yet"
         return held
 
-    def taken(self, reserve: tuple[float, float] | None, before: PourMasses, after: PourMasses, liquid: str) -> None:
+    def taken(self, reserve: tuple[float, float] | None, before: Weighing, after: Weighing, liquid: str) -> None:
         """Enter what the refill device has moved from the reservoir into a vessel.
 
         Args:

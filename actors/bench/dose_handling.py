@@ -25,7 +25,7 @@ from actors.arm.arm_interface import PlannedPour
 from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.arm.pour_feasibility import vessel as built
 from actors.balance.balance_settings import BalanceSettings
-from actors.balance.weighing_plan import SURE, PourMasses, weighing_uncertainty
+from actors.balance.weighing_plan import SURE, Weighing, weighing_uncertainty
 from actors.bench.cell_liquids import RESERVOIR, CellLiquids
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.liquid_supply import LiquidSupply
@@ -77,8 +77,8 @@ class CarriedDose:
 
     cup: str
     source: str
-    tare: PourMasses
-    gross: PourMasses
+    tare: Weighing
+    gross: Weighing
     missing: float | None
 
     @property
@@ -92,7 +92,7 @@ class CarriedDose:
 class _Tare:
     """Weight of the cup before a dose, its content then (mass and deviation), and what was missing [kg]."""
 
-    weight: PourMasses
+    weight: Weighing
     content: tuple[float, float]
     missing: float | None
 
@@ -252,7 +252,7 @@ class DoseHandling:
         self._laid_out = False
         self._filled: set[str] = set()
         self._tare: _Tare | None = None
-        self._stayed: tuple[str, PourMasses] | None = None
+        self._stayed: tuple[str, Weighing] | None = None
         self.placed: tuple[DoseReading, ...] = ()
 
     # ---- checks
@@ -477,7 +477,7 @@ class DoseHandling:
 
     async def set_up(
         self, consent: MotionConsent, scene: Scene, dose: DoseTarget, readings: Callable[[], Sequence[DoseReading]]
-    ) -> PourMasses:
+    ) -> Weighing:
         """Put the cup on the balance, weigh it, and take the source. Returns the tare.
 
         Args:
@@ -509,7 +509,7 @@ class DoseHandling:
             await carrier.take(source, consent)
         return tare
 
-    async def _closed(self, cup: str, gross: PourMasses, source: str, consent: MotionConsent) -> float | None:
+    async def _closed(self, cup: str, gross: Weighing, source: str, consent: MotionConsent) -> float | None:
         """Compare the weight of a cup with its account; a person is asked if they differ. Returns what is missing."""
         held, empty = self._record.held(cup), self._record.composition(cup).get("", (None, 0.0))
         content, spread = held or (0.0, 0.0)
@@ -617,6 +617,6 @@ class DoseHandling:
         self._carrier.forget()
         self._tare = self._stayed = None
 
-    async def _weigh(self) -> PourMasses:
+    async def _weigh(self) -> Weighing:
         weight = await self._carrier.balance.weigh()
-        return PourMasses(weight.mass, weighing_uncertainty(weight.step, self._weighing.deviation))
+        return Weighing(weight.mass, weighing_uncertainty(weight.step, self._weighing.deviation))

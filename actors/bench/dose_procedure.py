@@ -31,7 +31,7 @@ from actors.balance.weighing_plan import GRIP, Placement
 from actors.bench.consent import Setup, grams, start_question
 from actors.bench.dose_handling import DoseHandling
 from actors.bench.ground_truth import FASTEST_DOSE
-from actors.bench.pour_procedure import BenchProcedure, PourReport, largest_tilt
+from actors.bench.pour_procedure import BenchProcedure, CheckpointProgress, largest_tilt
 from actors.dosing.dose_controller import DoseController, DoseOrder, DoseResult, check_display
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, after_dose, check_dose, series_of, source_of, unknown_amount
@@ -111,7 +111,9 @@ class DoseProcedure(BenchProcedure):
             "dose": 10.0,
             "record": path.retreat_time,
         }
-        super().__init__(setup, scene, path, seed, PourReport(progress, parts, 10.0), LOOK_INTERVAL, FASTEST_DOSE)
+        super().__init__(
+            setup, scene, path, seed, CheckpointProgress(progress, parts, 10.0), LOOK_INTERVAL, FASTEST_DOSE
+        )
         self._series: DoseSeries | None = None
         self._placed: tuple[DoseReading, ...] = ()
         self._zero = self._at = self._duration = 0.0

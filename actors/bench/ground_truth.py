@@ -170,7 +170,7 @@ def spill_of(outcome: PourOutcome, mass: float) -> Spill:
 
 
 @dataclass(frozen=True)
-class PourAsk:
+class GroundTruthTask:
     """The current pour; `seed` is the seed of all its randomness.
 
     Attributes:
@@ -208,7 +208,7 @@ class GroundTruth:
         self._time_scale = time_scale
         self.clock = DeviceClock()
 
-    async def prepare(self, pour: PourAsk) -> None:
+    async def prepare(self, pour: GroundTruthTask) -> None:
         """Called before the operator prepares the pour."""
 
     @contextlib.asynccontextmanager

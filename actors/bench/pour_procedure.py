@@ -4,7 +4,7 @@ Two rules always hold. While a question invites hands into the cell, no program 
 back first. The arm moves only after the operator has confirmed the motion and has been informed of the time until it
 starts.
 
-`PourProcedure` runs the steps in the frame of `BenchProcedure`, which doses have, too. `PourReport` reports the
+`PourProcedure` runs the steps in the frame of `BenchProcedure`, which doses have, too. `CheckpointProgress` reports the
 progress to a callback. Questions are in `actors.bench.consent`, weighings in `actors.balance.weighing`.
 """
 
@@ -31,9 +31,9 @@ from actors.arm.arm_interface import (
 from actors.arm.pour_feasibility import vessel
 from actors.balance.balance_interface import BalanceError, NoConnectionError
 from actors.balance.weighing import Weighings
-from actors.balance.weighing_plan import Placement, PourMasses
+from actors.balance.weighing_plan import Placement, Weighing
 from actors.bench.consent import Consent, Setup, grams, start_question
-from actors.bench.ground_truth import PourAsk
+from actors.bench.ground_truth import GroundTruthTask
 from actors.dosing.dose_estimator import DoseReading
 from actors.interfaces import (
     DoseProgress,
@@ -53,7 +53,7 @@ from sim_engine.outcome import PourMeasurement, RecordedFrames
 from sim_engine.scene import SampledMotion, Scene
 
 
-class PourReport:
+class CheckpointProgress:
     """Progress of a pour as elapsed bench time over expected bench time; it never decreases.
 
     Args:
@@ -159,7 +159,7 @@ class BalanceReadings:
         scale: bench seconds per second of the clock, while readings are used.
     """
 
-    def __init__(self, setup: Setup, report: PourReport, interval: float, scale: float) -> None:
+    def __init__(self, setup: Setup, report: CheckpointProgress, interval: float, scale: float) -> None:
         self._balance, self._report, self._interval, self._scale = setup.balance, report, interval, scale
         self._clock = setup.ground_truth.clock
         self._kept: list[DoseReading] = []
@@ -225,7 +225,7 @@ class BenchProcedure(ABC):
         scene: Scene,
         path: PlannedPour,
         seed: int,
-        report: PourReport,
+        report: CheckpointProgress,
         interval: float,
         fastest: float = math.inf,
     ) -> None:
@@ -349,10 +349,10 @@ class PourProcedure(BenchProcedure):
         path: PlannedPour,
         *,
         seed: int,
-        known: Mapping[str, PourMasses] | None,
+        known: Mapping[str, Weighing] | None,
         progress: ProgressCallback | None,
     ) -> None:
-        report = PourReport(progress, _expected(setup, path), path.pour_time)
+        report = CheckpointProgress(progress, _expected(setup, path), path.pour_time)
         super().__init__(setup, scene, path, seed, report, LOOK_INTERVAL)
         self._action = action
         self._weighings = Weighings(
@@ -361,7 +361,7 @@ class PourProcedure(BenchProcedure):
         self._broken: Exception | None = None
 
     @property
-    def lasting(self) -> dict[str, PourMasses]:
+    def lasting(self) -> dict[str, Weighing]:
         """Weighings that remain valid for later pours with this pourer."""
         return self._weighings.lasting
 
@@ -377,8 +377,8 @@ class PourProcedure(BenchProcedure):
         setup = self._setup
         await self._ready()
         show = self._report.pour if self._report.watched else None
-        await setup.ground_truth.prepare(PourAsk(self._scene, self._action, self._path, self._seed, show))
-        source_masses: dict[str, PourMasses] = {}
+        await setup.ground_truth.prepare(GroundTruthTask(self._scene, self._action, self._path, self._seed, show))
+        source_masses: dict[str, Weighing] = {}
         if setup.handling is not None:
             source_masses = await setup.handling.prepare(
                 self._consent, self._weighings.weighed.get("pourer_empty"), self._seed
@@ -467,7 +467,7 @@ class PourProcedure(BenchProcedure):
 
     # ---- records
 
-    def _note_weight(self, key: str, weighed: PourMasses) -> None:
+    def _note_weight(self, key: str, weighed: Weighing) -> None:
         """Write a weight to the journal at once, so that no later failure can lose it."""
         if key == "pourer_full" and self._setup.held is not None:
             self._setup.held.stood(weighed.mass)

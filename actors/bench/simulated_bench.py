@@ -20,7 +20,7 @@ from actors.balance.simulated_balance import SimulatedBalanceSettings
 from actors.bench.bench_operators import OperatorQuestions
 from actors.bench.ground_truth import (
     GroundTruth,
-    PourAsk,
+    GroundTruthTask,
     Spill,
     TouchingError,
     draw_pose_error,
@@ -75,7 +75,7 @@ class SimulatedBench(GroundTruth):
     def __init__(self, spec: BenchSettings, simulators: SimulatorPool, arm: DeviceArm, balance: DeviceBalance) -> None:
         super().__init__(spec.time_scale)
         self._spec, self._simulators, self._arm, self._balance = spec, simulators, arm, balance
-        self._pour: PourAsk | None = None
+        self._pour: GroundTruthTask | None = None
         self._liquid: asyncio.Task[Spill] | None = None
         self._live = LivePourProcess()
 
@@ -103,7 +103,7 @@ class SimulatedBench(GroundTruth):
         """See `GroundTruth.close`."""
         await asyncio.to_thread(self._live.close)
 
-    async def prepare(self, pour: PourAsk) -> None:
+    async def prepare(self, pour: GroundTruthTask) -> None:
         """See `GroundTruth.prepare`; starts the simulation of the liquid."""
         self._pour = pour
         self._liquid = asyncio.create_task(

@@ -22,7 +22,7 @@ from actors.arm.arm_interface import PlannedPour
 from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.arm.pour_feasibility import vessel as built
 from actors.balance.balance_settings import BalanceSettings
-from actors.balance.weighing_plan import GRIP, SURE, PourMasses, weighing_uncertainty
+from actors.balance.weighing_plan import GRIP, SURE, Weighing, weighing_uncertainty
 from actors.bench.cell_liquids import CellLiquids
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.liquid_supply import LiquidSupply
@@ -62,11 +62,11 @@ BACK = "pour the receiver back into the pourer on the balance, slowly, and put i
 
 
 @dataclass(frozen=True)
-class _Poured:
+class _LastWeighings:
     """Weighings of the last pour, while its liquid is in the receiver."""
 
-    received: PourMasses
-    pourer_after: PourMasses
+    received: Weighing
+    pourer_after: Weighing
 
 
 def _loads(scene: Scene) -> dict[str, Load]:
@@ -197,10 +197,10 @@ class VesselHandling:
         self._scene: Scene | None = None
         self._ways: Ways = {}
         self._back: PlannedPour | None = None
-        self._poured: _Poured | None = None
-        self._dry: PourMasses | None = None
-        self._gross: PourMasses | None = None
-        self._pending: tuple[_Poured, PourMasses, PourMasses] | None = None
+        self._poured: _LastWeighings | None = None
+        self._dry: Weighing | None = None
+        self._gross: Weighing | None = None
+        self._pending: tuple[_LastWeighings, Weighing, Weighing] | None = None
         self._cycle: dict[str, float] = {}
 
     # ---- checks
@@ -228,7 +228,7 @@ class VesselHandling:
 
     # ---- the cycle
 
-    async def prepare(self, consent: MotionConsent, empty: PourMasses | None, seed: int) -> dict[str, PourMasses]:
+    async def prepare(self, consent: MotionConsent, empty: Weighing | None, seed: int) -> dict[str, Weighing]:
         """Prepare the next pour: lay out the vessels, or pour back what the last one has poured.
 
         Args:
@@ -271,7 +271,7 @@ class VesselHandling:
         await self._truth.poured_back(seed)
         await self._carrier.back_home(path)
 
-    async def _topped_up(self, consent: MotionConsent, back: PourMasses, empty: PourMasses, seed: int) -> PourMasses:
+    async def _topped_up(self, consent: MotionConsent, back: Weighing, empty: Weighing, seed: int) -> Weighing:
         """Fill the pourer up, by the refill device or the operator, until it holds what is asked for."""
         assert self._scene is not None
         liquid, now, problem, tries = self._scene.liquid, back, "", 0
@@ -370,7 +370,7 @@ class VesselHandling:
             await self._carrier.take("pourer", consent)
         self._unknown_contents()
 
-    async def _account(self, gross: PourMasses, consent: MotionConsent) -> None:
+    async def _account(self, gross: Weighing, consent: MotionConsent) -> None:
         """Compare the masses of a whole cycle; ask a person if they do not close."""
         if self._dry is None:
             await self._right_vessel(gross, consent)
@@ -407,7 +407,7 @@ class VesselHandling:
         )
         await self._go_on(question, consent)
 
-    async def _right_vessel(self, gross: PourMasses, consent: MotionConsent) -> None:
+    async def _right_vessel(self, gross: Weighing, consent: MotionConsent) -> None:
         """Ask a person if the dry receiver on the balance does not weigh what its file states."""
         empty = self._carrier.loads["receiver"].empty_mass
         if abs(gross.mass - empty) <= WRONG:
@@ -427,12 +427,12 @@ class VesselHandling:
             raise LaboratoryError("the masses are not what they should be, and the operator ended the cycle")
         await consent.given(move_question("take the pourer"))
 
-    def poured(self, weighed: Mapping[str, PourMasses]) -> None:
+    def poured(self, weighed: Mapping[str, Weighing]) -> None:
         """The pour was weighed: what it poured is in the receiver, and the pourer stands on the balance."""
         received, full, after, empty = (
             weighed[key] for key in ("received", "pourer_full", "pourer_after", "pourer_empty")
         )
-        self._poured = _Poured(received, after)
+        self._poured = _LastWeighings(received, after)
         gross, dry = self._gross, self._dry
         film = () if gross is None or dry is None or gross is dry else (gross, dry)
         left = film[0].mass - film[1].mass if film else 0.0
@@ -456,9 +456,9 @@ class VesselHandling:
 
     # ---- weights
 
-    async def _weigh(self) -> PourMasses:
+    async def _weigh(self) -> Weighing:
         weight = await self._carrier.balance.weigh()
-        return PourMasses(weight.mass, weighing_uncertainty(weight.step, self._weighing.deviation))
+        return Weighing(weight.mass, weighing_uncertainty(weight.step, self._weighing.deviation))
 
     def _enter(self, vessel: str, mass: float | None, deviation: float) -> None:
         assert self._scene is not None

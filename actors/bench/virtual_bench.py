@@ -32,7 +32,7 @@ from actors.bench.flowing_liquid import FOLLOWED, FlowEnd, FlowingLiquid, FlowOr
 from actors.bench.ground_truth import (
     FASTEST_DOSE,
     GroundTruth,
-    PourAsk,
+    GroundTruthTask,
     draw_pose_error,
     liquid_seed,
     spill_of,
@@ -399,11 +399,11 @@ class VirtualBench(GroundTruth):
         super().__init__(time_scale)
         self._spec, self._simulators = spec, simulators
         self.emulators, self.contents, self._hands = emulators, hands.contents, hands
-        self._pour: PourAsk | None = None
+        self._pour: GroundTruthTask | None = None
         self._landed = False
         self._left: bool | None = None  # whether liquid may have left the pourer; None before it is known
 
-    async def prepare(self, pour: PourAsk) -> None:
+    async def prepare(self, pour: GroundTruthTask) -> None:
         """See `GroundTruth.prepare`."""
         self._pour = pour
         self.contents.pourer, self.contents.receiver = "pourer", "receiver"
@@ -467,7 +467,7 @@ class VirtualBench(GroundTruth):
             )
         return slipped(SampledMotion(executed.times, executed.poses), grip_tilt)
 
-    async def _simulate(self, pour: PourAsk, motion: SampledMotion, error: PoseError) -> tuple[float, float]:
+    async def _simulate(self, pour: GroundTruthTask, motion: SampledMotion, error: PoseError) -> tuple[float, float]:
         """Masses spilled and retained [kg]; the same motion and seed give the same masses."""
         mass = self.contents.in_pourer
         scene = replace(pour.scene, liquid=pour.scene.liquid.model_copy(update={"mass": mass}))

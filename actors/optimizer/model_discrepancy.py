@@ -71,7 +71,7 @@ from scipy.stats import qmc
 
 from actors.optimizer.gaussian_process import GaussianProcess, constant_mean_process
 from actors.optimizer.prediction_intervals import highest_density_intervals
-from actors.optimizer.questions import CalibrationPours, ModelDiscrepancy
+from actors.optimizer.questions import ModelDiscrepancy, SceneEvidence
 
 Array = NDArray[np.float64]
 Remake = Callable[[Array], "Hypotheses"]
@@ -331,7 +331,7 @@ class _CalibratedScene:
     misled: float
 
     @classmethod
-    def of(cls, pours: CalibrationPours, worst: float) -> _CalibratedScene:
+    def of(cls, pours: SceneEvidence, worst: float) -> _CalibratedScene:
         """Fit the surrogate."""
         points, simulated = np.array(pours.points), np.array(pours.simulated)
         surrogate = constant_mean_process(points, simulated)

@@ -65,7 +65,7 @@ def found_good(costs: Iterable[float]) -> bool:
 
 
 @dataclass(frozen=True)
-class CalibrationPours:
+class SceneEvidence:
     """Weighed pours of a calibration in one scene, each with its simulation by the θ that the simulations use.
 
     Attributes:
@@ -108,7 +108,7 @@ class ModelDiscrepancy:
     pours_left: int = 0
     limit: Limit | None = None
     lookahead: bool = True
-    calibration: tuple[CalibrationPours, ...] | None = field(default=None, metadata=WRITTEN_IF_SET)
+    calibration: tuple[SceneEvidence, ...] | None = field(default=None, metadata=WRITTEN_IF_SET)
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ from sim_engine.settings.model import (
 from sim_engine.settings.quantity import Quantity, QuantityError, parse_quantity, plain_number
 
 
-class PoursFromFile(Settings):
+class TableSource(Settings):
     """Weighed pours in a file."""
 
     source: FilePath | None = Field(default=None, alias="from")
@@ -84,7 +84,7 @@ class TransferSettings(Settings):
     """Values of the motion that differ from calibration's."""
 
 
-class PoursSettings(PoursFromFile):
+class PoursSettings(TableSource):
     """Pours to calibrate on: to be made (`count`), or weighed already (`from`, `from_run`)."""
 
     count: PositivePourCount | None = None
@@ -185,7 +185,7 @@ class CalibrationSection(StageSettings):
         return settings_in(self, CalibrationSettings)  # type: ignore[type-abstract]
 
 
-class DataSettings(PoursFromFile):
+class DataSettings(TableSource):
     """Pours from before the campaign that deployment uses as data: from a file, or from a previous run."""
 
     source: FilePath | None = Field(default=None, alias="from")

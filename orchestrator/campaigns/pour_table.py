@@ -74,7 +74,7 @@ class RecordTable:
     """
 
     path: Path
-    rows: list[PourRecordRow] = field(default_factory=list)
+    rows: list[RecordRow] = field(default_factory=list)
     dimensions: tuple[str, ...] = ()
     problems: list[Problem] = field(default_factory=list)
     assumed: str = ""
@@ -89,7 +89,7 @@ class RecordTable:
 
 
 @dataclass(frozen=True)
-class PourRecordRow:
+class RecordRow:
     """One line: action dimensions [SI], masses [kg]."""
 
     line: int
@@ -147,7 +147,7 @@ def read_records(
     except ConfigError as error:
         table.problems.extend(error.problems)
         return table
-    reader = _PourReader(saved, table, loaded, lip_radius, split)
+    reader = _RecordReader(saved, table, loaded, lip_radius, split)
     reader.read({theirs: ours for ours, theirs in (columns or {}).items()})
     notes = [saved.note, *reader.notes]
     if reader.without_split and split is None and not table.problems:
@@ -162,7 +162,7 @@ def read_records(
 
 
 @dataclass
-class _PourReader:
+class _RecordReader:
     """Fills a table of pours from a saved table; see `read_records`."""
 
     saved: SavedTable
@@ -219,7 +219,7 @@ class _PourReader:
             elif len(lines) > 1:
                 self._check_doubled([row for row in table.rows if row.line in {line.line for line in lines}])
 
-    def _check_doubled(self, rows: list[PourRecordRow]) -> None:
+    def _check_doubled(self, rows: list[RecordRow]) -> None:
         """Note lines with the same numbers; refuse a pour that spilled, as training and as test pour."""
         splits = {row.split for row in rows}
         if not rows:
@@ -259,7 +259,7 @@ class _PourReader:
                 text = "needs 'lip_radius' beside 'from' in the campaign, the pourer's inner radius at the lip"
                 add(LIP_COLUMN, text)
 
-    def _row(self, line: TableRow, columns: Sequence[FoundColumn | None]) -> PourRecordRow | None:
+    def _row(self, line: TableRow, columns: Sequence[FoundColumn | None]) -> RecordRow | None:
         saved, problems = self.saved, self.table.problems
         before = len(problems)
         index = {column.standard: i for i, column in enumerate(columns) if column is not None}
@@ -310,7 +310,7 @@ class _PourReader:
             for i, cell in enumerate(line.cells)
             if columns[i] is None and cell != ""
         }
-        return PourRecordRow(line.line, action, poured, spilled, retained, split, remarks)
+        return RecordRow(line.line, action, poured, spilled, retained, split, remarks)
 
 
 def _listed(noun: str, items: Sequence[str]) -> str:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.campaigns.fingerprint import scene_by_content
-from orchestrator.learning.calibration.pour_design import DesignPoured
+from orchestrator.learning.calibration.pour_design import DesignResult
 from orchestrator.learning.campaign_plan import RecordedPour
 from orchestrator.learning.strategy import is_sound
 from orchestrator.records.codec import Results
@@ -84,7 +84,7 @@ def _splits(results: Results) -> dict[tuple[str, int], str]:
     return {
         (stage, pour.number): pour.split
         for stage, result in results.items()
-        if isinstance(result, DesignPoured)
+        if isinstance(result, DesignResult)
         for pour in result.pours
     }
 

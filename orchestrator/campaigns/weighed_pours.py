@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.campaigns.campaign_file import DataSettings, PoursFromFile, PoursSettings
+from orchestrator.campaigns.campaign_file import DataSettings, PoursSettings, TableSource
 from orchestrator.campaigns.pour_table import LIP_COLUMN, RecordTable, column_name, read_records
 from orchestrator.campaigns.prior_data import PreviousRun, fitting, pours_in, read_former_run
 from orchestrator.campaigns.scene_builder import SceneBuilder
@@ -107,7 +107,7 @@ def read_table(
 
 def _read(
     path: Path,
-    pours: PoursFromFile,
+    pours: TableSource,
     liquid: Liquid,
     place: Place,
     report: Report,

@@ -193,7 +193,7 @@ def plan(
         run_at_terminal,
     )
     from orchestrator.learning.deployment.deployment_result import Deployed
-    from orchestrator.learning.single_action import PredictedPour
+    from orchestrator.learning.single_action import ActionPrediction
     from orchestrator.records.codec import result_of
     from orchestrator.reports.run_summary import PLANNED
     from orchestrator.runs.run_service import RunResources
@@ -223,7 +223,7 @@ def plan(
             conclude(published.summary.verdict)
         assert recommended is not None
         receiver_name = stage.name.removeprefix(DEPLOYMENT)
-        repeated = result_of(run_result.results, PREDICTION + receiver_name, PredictedPour).over_seeds
+        repeated = result_of(run_result.results, PREDICTION + receiver_name, ActionPrediction).over_seeds
         spillage = repeated.get("spillage")
         told = published.summary.outcome.receivers[result.scene]
         answers.append(

@@ -31,7 +31,7 @@ from orchestrator.cli.console import (
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Executed, PlannedPour
     from orchestrator.learning.campaign_plan import CampaignPlan
-    from orchestrator.learning.single_action import WeighedPour
+    from orchestrator.learning.single_action import DeliveredMasses
     from sim_engine.action import Action
     from sim_engine.scene import Scene
 
@@ -223,7 +223,7 @@ def pour_weighed(chosen: Chosen, *, in_process: bool, again: str) -> Path:
         SystemExit: nothing was weighed (exit code 4).
     """
     from orchestrator.cli.foreground_run import conclude, resources_with_operator, run_at_terminal
-    from orchestrator.learning.single_action import OnePoured
+    from orchestrator.learning.single_action import SingleResult
     from orchestrator.records.codec import result_of
     from orchestrator.runs.run_tasks import pour_task
     from orchestrator.runs.stages import POUR
@@ -236,14 +236,14 @@ def pour_weighed(chosen: Chosen, *, in_process: bool, again: str) -> Path:
         again=lambda folder: again,
         not_resumed="this pour is not resumed; what was weighed of it",
     )
-    result = result_of(finished.results, POUR, OnePoured)
+    result = result_of(finished.results, POUR, SingleResult)
     if result.weighed is not None:
         print(told(result.weighed))
     conclude(published.summary.verdict)
     return finished.directory
 
 
-def told(weighed: WeighedPour) -> str:
+def told(weighed: DeliveredMasses) -> str:
     """What was weighed, in a line."""
     spillage = "too little was poured to speak of spillage"
     if weighed.spillage is not None:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from actors.laboratory_settings import LaboratorySettings
-from actors.optimizer.questions import WRITTEN_IF_SET, BenchOffset, CalibrationPours, Linear
+from actors.optimizer.questions import WRITTEN_IF_SET, BenchOffset, Linear, SceneEvidence
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory
 from orchestrator.learning.deployment.objectives import Objective
 from orchestrator.learning.strategy import plural
@@ -311,7 +311,7 @@ class CalibrationEvidence:
         lines: the used pours, and the reasons why others are not used, one text each.
     """
 
-    pours: tuple[CalibrationPours, ...] = ()
+    pours: tuple[SceneEvidence, ...] = ()
     lines: tuple[str, ...] = ()
 
     def __add__(self, other: CalibrationEvidence) -> CalibrationEvidence:

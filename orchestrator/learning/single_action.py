@@ -1,8 +1,8 @@
 """Strategies that run one given action and search for no better one.
 
-- `OnePour` pours once with the user's action; `OnePoured` is its result.
+- `OnePour` pours once with the user's action; `SingleResult` is its result.
 - `Confirmation` repeats the action that a deployment recommends; `Confirmed` is its result.
-- `RepeatedSimulation` simulates an action with new seeds to predict it; `PredictedPour` is its result.
+- `RepeatedSimulation` simulates an action with new seeds to predict it; `ActionPrediction` is its result.
 
 A failed pour is never repeated.
 """
@@ -15,7 +15,7 @@ from typing import Literal
 
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.deployment_result import Recommended
-from orchestrator.learning.deployment.real_pours import PourTrial
+from orchestrator.learning.deployment.real_pours import DeploymentTrial
 from orchestrator.learning.requests import (
     Decision,
     Failed,
@@ -48,19 +48,19 @@ FINE = 20_000
 """Number of particles of the simulation that shows how much the resolution matters."""
 
 
-class WeighedPour(WeighedMasses):
+class DeliveredMasses(WeighedMasses):
     """Masses of a single pour."""
 
     delivered_ml: float
     """The delivered mass as a volume [ml], from the liquid's density."""
 
 
-class OnePoured(StageResult):
+class SingleResult(StageResult):
     """Result of a single pour with a user's action."""
 
     kind: Literal["pour"] = "pour"
 
-    weighed: WeighedPour | None = None
+    weighed: DeliveredMasses | None = None
     """The weights; None before the weighing and after a failure."""
 
     failed: str | None = None
@@ -115,19 +115,19 @@ class OnePour:
         """Pours done, and their total number."""
         return Progress(pours=int(self.finished), of_pours=1)
 
-    def result(self) -> OnePoured:
+    def result(self) -> SingleResult:
         """The weights, or the reason why there are none."""
         match self._outcome:
             case PourMeasurement() as measured:
                 volume = self._liquid.millilitres(measured.delivered)
                 masses = weighed_masses(measured).model_dump()
-                return OnePoured(weighed=WeighedPour(**masses, delivered_ml=volume))
+                return SingleResult(weighed=DeliveredMasses(**masses, delivered_ml=volume))
             case Failed(kind, reason):
-                return OnePoured(failed=f"{kind}: {reason}")
-        return OnePoured()
+                return SingleResult(failed=f"{kind}: {reason}")
+        return SingleResult()
 
 
-class PredictedPour(StageResult):
+class ActionPrediction(StageResult):
     """Statistics of repeated simulations of one action with new seeds.
 
     The loss includes simulations in which the cups touched because of an error. The fractions do not, because they are
@@ -264,13 +264,13 @@ class RepeatedSimulation:
         answered = len(self._spilled)
         return Progress(answered, answered + len(self._open) + len(self._unissued))
 
-    def result(self) -> PredictedPour:
+    def result(self) -> ActionPrediction:
         """Mean and standard deviation over the seeds answered so far."""
         over_seeds = spreads(self._outcomes)
         loss = SampleStatistics.of(self._losses)
         if loss is not None:
             over_seeds["loss"] = loss
-        return PredictedPour(
+        return ActionPrediction(
             scene=self._costing.scene.name,
             simulations=self.progress().simulations,
             simulations_lost=self._lost,
@@ -296,7 +296,7 @@ CONFIRM = "confirm"
 """Purpose of these pours."""
 
 
-class ConfirmingPour(WeighedMasses):
+class ConfirmationRow(WeighedMasses):
     """A pour of the recommended action."""
 
     number: int
@@ -320,7 +320,7 @@ class Confirmed(StageResult):
     scene: str
     """Name of the scene."""
 
-    pours: tuple[ConfirmingPour, ...]
+    pours: tuple[ConfirmationRow, ...]
     """All completed pours, in the order made."""
 
     loss: SampleStatistics | None
@@ -355,7 +355,7 @@ class Confirmation:
         self._count = 0 if recommended is None else count
         self._seeds = SeedStream(seed, f"confirm {costing.scene.name}")
         self._pouring: Pour | None = None
-        self._pours: list[ConfirmingPour] = []
+        self._pours: list[ConfirmationRow] = []
         self.decisions: list[Decision] = []
         if recommended is None:
             self.decisions.append(Decision("no action is recommended, so there is nothing to confirm"))
@@ -389,13 +389,13 @@ class Confirmation:
             raise ValueError(f"this pour was not asked for: {request}")
         self._pouring = None
         assert self._recommended is not None
-        trial = PourTrial(pour.number, (), dict(self._recommended.action_si), pour.predicted, 0.0)
+        trial = DeploymentTrial(pour.number, (), dict(self._recommended.action_si), pour.predicted, 0.0)
         trial.take(outcome, self._costing.scene, self._costing, penalised=False)
         if trial.status == "refused":
             self._count = len(self._pours) + 1  # it would be refused again
         row = trial.row(self._costing.scene.liquid)
         self._pours.append(
-            ConfirmingPour(
+            ConfirmationRow(
                 number=row.number,
                 failed=f"invalid_action: {row.reason}" if row.status == "refused" else row.reason,
                 loss=row.loss,

@@ -3,9 +3,10 @@
 `diagnose` compares explanations of the same pours: `RigDiagnosis`, a list of `Explanation`.
 
 - `lag` and `holds` are read directly, from the placing of the receiver and from repeated readings while the mass rises.
-- `grip`, `height` and `viscosity` explain all readings of the pours, with one model of a cup and its lip (`_PourModel`)
-  that is fitted to all pours together. In each explanation, one quantity is as uncertain as `WIDE` says, and the others
-  keep the tolerance of a rig in order (`NOMINAL`). The viscosity is tried at `FACTORS` of the file's.
+- `grip`, `height` and `viscosity` explain all readings of the pours, with one model of a cup and its lip
+  (`_ReadingsModel`) that is fitted to all pours together. In each explanation, one quantity is as uncertain as `WIDE`
+  says, and the others keep the tolerance of a rig in order (`NOMINAL`). The viscosity is tried at `FACTORS` of the
+  file's.
 - Each has an evidence: the logarithm of the Bayes factor against 'nothing is wrong' (Laplace's approximation; MacKay,
   Information Theory, Inference, and Learning Algorithms, chapter 28). More than `STANDS_OUT` counts.
 
@@ -308,7 +309,7 @@ def _possible(liquid: Liquid, factor: float) -> bool:
 PER_POUR = len(OWN) + 1
 
 
-class _PourModel:
+class _ReadingsModel:
     """The readings of several pours for several states at once, from a tilting cup with a lip that wets.
 
     A state (P,) is in deviations from what was known before: `SHARED`, then `PER_POUR` for each pour.
@@ -433,7 +434,7 @@ class _Fit:
 
     def predicted(self, recording: PourRecording) -> PredictedDose:
         """A dose that was not fitted, from its tilt."""
-        count, model = len(SHARED), _PourModel([recording], self.factor)
+        count, model = len(SHARED), _ReadingsModel([recording], self.factor)
         state = np.append(self.state[:count], np.zeros(PER_POUR))
         covariance = np.eye(len(state))
         covariance[:count, :count] = self.covariance[:count, :count]
@@ -445,7 +446,7 @@ class _Fit:
 
 def _fit(pours: Sequence[PourRecording], factor: float, state: Floats) -> _Fit:
     """The fit of a multiple of the file's viscosity, by Levenberg's method from a first state."""
-    model, lag = _PourModel(pours, factor), lag_before(pours)
+    model, lag = _ReadingsModel(pours, factor), lag_before(pours)
     for noise in (5.0, 1.0):
         residuals, slopes = model.whitened(state, lag, noise)
         damping = 0.0

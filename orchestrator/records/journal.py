@@ -43,7 +43,7 @@ from orchestrator.records.journal_check import (
     BEGUN,
     LEDGER_NAME,
     LedgerLine,
-    PourLedger,
+    LedgerWriter,
     check_journal,
     has_begun,
     read_ledger,
@@ -239,7 +239,7 @@ class Journal(JournalReader):
         self.header = self._read_header()
         self._last = _last_of_chain(connection)
         self._unwritten: list[LedgerLine] = []
-        self._ledger: PourLedger
+        self._ledger: LedgerWriter
         self._runs = False
 
     @classmethod
@@ -392,7 +392,7 @@ class Journal(JournalReader):
                 self._connection.execute("rollback")
             raise
 
-    def _open_ledger(self) -> PourLedger:
+    def _open_ledger(self) -> LedgerWriter:
         """The ledger, with all entries of the journal about pours.
 
         Raises:
@@ -403,9 +403,9 @@ class Journal(JournalReader):
             if not path.is_file():
                 (seq, digest), created = self._last, self.header.created
                 body = {"name": self.header.name, "created": created, "entries": seq}
-                ledger = PourLedger.begin(path, [LedgerLine(seq, digest.hex(), created, BEGUN, "", body)])
+                ledger = LedgerWriter.begin(path, [LedgerLine(seq, digest.hex(), created, BEGUN, "", body)])
             else:
-                ledger = PourLedger.resume(path)
+                ledger = LedgerWriter.resume(path)
                 if missing := self._lines_about_pours(after=max(line.seq for line in read_ledger(path))):
                     ledger.append(missing)
             return ledger

@@ -56,7 +56,7 @@ class LedgerLine:
     body: dict[str, Any]
 
 
-class PourLedger:
+class LedgerWriter:
     """The only writer of a ledger. Its caller holds the journal's lock."""
 
     def __init__(self, path: Path, descriptor: int, size: int, last: str) -> None:

@@ -117,7 +117,7 @@ def _drawings(plan: CampaignPlan, results: Results, directory: Path | None = Non
     if plan.deployment is None:
         return drawings
     unit = deployment_unit(plan.deployment)
-    if series := pour_series(plan, results, unit):
+    if series := loss_series(plan, results, unit):
         title = f"Loss of every pour: {plan.name}"
         drawings["loss against pours"] = partial(draw_losses, series, cost=unit.label, title=title)
     for scene, result in deployments_of(results).items():
@@ -213,7 +213,7 @@ def deployment_picture(plan: CampaignPlan, result: Deployed) -> SurrogatePicture
     )
 
 
-def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[PourSeries]:
+def loss_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[LossSeries]:
     """Pours by receiver, for `draw_losses`; refused ones (nothing was poured) are left out."""
     series = []
     for scene, result in deployments_of(results).items():
@@ -234,7 +234,7 @@ def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[Po
             )
             for pour in pours
         ]
-        series.append(PourSeries(f"{receiver_name(plan, scene)} ({result.strategy})", losses, predictions))
+        series.append(LossSeries(f"{receiver_name(plan, scene)} ({result.strategy})", losses, predictions))
     return series
 
 
@@ -260,7 +260,7 @@ TOP = 1.08
 
 
 @dataclass(frozen=True)
-class PourSeries:
+class LossSeries:
     """Pours into one receiver, in the order they were made.
 
     Attributes:
@@ -285,7 +285,7 @@ class PourSeries:
         return running
 
 
-def draw_losses(series: Sequence[PourSeries], *, cost: str, title: str) -> Figure:
+def draw_losses(series: Sequence[LossSeries], *, cost: str, title: str) -> Figure:
     """Loss against pours, one panel for each receiver: measured, best so far, and prediction interval.
 
     Args:
@@ -336,7 +336,7 @@ def draw_dose(dose: Dose) -> Figure:
     return figure
 
 
-def _pour_title(series: PourSeries, cost: str) -> str:
+def _pour_title(series: LossSeries, cost: str) -> str:
     """Receiver and loss of the best pour, with the unit of the cost's label."""
     worked = [(loss, number) for number, loss in enumerate(series.losses, start=1) if loss is not None]
     if not worked:
@@ -346,7 +346,7 @@ def _pour_title(series: PourSeries, cost: str) -> str:
     return f"{series.receiver}: best {loss:.3g} {unit} (pour {number})"
 
 
-def _pour_panel(axes: Axes, series: PourSeries) -> float:
+def _pour_panel(axes: Axes, series: LossSeries) -> float:
     """Draw one receiver; returns the largest value that must be visible."""
     from matplotlib.ticker import MaxNLocator
 

@@ -18,7 +18,7 @@ from orchestrator.learning.calibration.calibration_scores import CalibrationGain
 from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
 from orchestrator.learning.deployment.deployment_result import Recommended
 from orchestrator.learning.deployment.model_monitoring import Believed
-from orchestrator.learning.deployment.real_pours import PourRow, PredictionCheck
+from orchestrator.learning.deployment.real_pours import DeploymentRow, PredictionCheck
 from orchestrator.learning.single_action import Confirmed
 from orchestrator.learning.stage_result import ResultPart, StageResult, WeighedMasses
 from orchestrator.learning.strategy_registry import result_kinds
@@ -227,10 +227,10 @@ class ReceiverSummary(ResultPart):
 
     refused_pours: int
     simulations: int
-    first: PourRow | None
+    first: DeploymentRow | None
     """The first weighed pour."""
 
-    best: PourRow | None
+    best: DeploymentRow | None
     """The pour with the smallest loss."""
 
     recommended: Recommended | None

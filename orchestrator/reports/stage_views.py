@@ -15,7 +15,7 @@ from orchestrator.learning.calibration.calibration_scores import (
     recommended_theta,
 )
 from orchestrator.learning.deployment.deployment_result import Deployed
-from orchestrator.learning.single_action import Confirmed, PredictedPour
+from orchestrator.learning.single_action import ActionPrediction, Confirmed
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.records.codec import Results
 from sim_engine.liquids import SimulationParameters
@@ -69,9 +69,9 @@ def confirmations_of(results: Results) -> dict[str, Confirmed]:
     return {result.scene: result for result in all_of(results, Confirmed)}
 
 
-def predictions_of(results: Results) -> dict[str, PredictedPour]:
+def predictions_of(results: Results) -> dict[str, ActionPrediction]:
     """Results of the repeated simulations of the recommended actions, by scene."""
-    return {result.scene: result for result in all_of(results, PredictedPour)}
+    return {result.scene: result for result in all_of(results, ActionPrediction)}
 
 
 def calibrated_label(evaluation: Scores) -> str | None:

@@ -12,7 +12,7 @@ from orchestrator.learning.calibration.calibration_scores import Scores
 from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan, receiver_names
 from orchestrator.learning.deployment.deployment_result import Deployed
-from orchestrator.learning.single_action import Confirmed, PredictedPour
+from orchestrator.learning.single_action import ActionPrediction, Confirmed
 from orchestrator.learning.stage_result import weighed_masses
 from orchestrator.records.codec import Results
 from orchestrator.records.journal_check import JournalCheck
@@ -379,7 +379,7 @@ def _receiver(
     plan: DeploymentPlan | None,
     name: str,
     result: Deployed,
-    predicted: PredictedPour | None,
+    predicted: ActionPrediction | None,
     not_covered: Sequence[NotCovered],
     confirmed: Confirmed | None,
 ) -> ReceiverSummary:

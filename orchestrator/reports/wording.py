@@ -15,7 +15,7 @@ from actors.dosing.dose_series import LOST
 from orchestrator.learning.calibration.calibration_scores import Scores
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory, MemoryFound
 from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
-from orchestrator.learning.calibration.pour_residuals import PourResidual
+from orchestrator.learning.calibration.pour_residuals import SpillageResidual
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan
 from orchestrator.learning.deployment.deployment_ledger import EQUAL_LOSS
 from orchestrator.learning.deployment.deployment_result import Recommended
@@ -686,7 +686,7 @@ def pour_tables(summary: RunSummary) -> list[ResultTable]:
     ]
 
 
-def _residual_table(pours: Sequence[PourResidual]) -> ResultTable:
+def _residual_table(pours: Sequence[SpillageResidual]) -> ResultTable:
     names = {name: None for pour in pours for name in pour.action}
     varied = [name for name in names if len({pour.action.get(name) for pour in pours}) > 1]
     remarks = list(dict.fromkeys(name for pour in pours for name in pour.remarks))

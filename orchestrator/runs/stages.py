@@ -17,8 +17,8 @@ import numpy as np
 from actors.dosing.dose_estimator import calibrated_knowledge
 from actors.interfaces import DoseKnowledge
 from orchestrator.learning.calibration.action_prior import Contexts, drawn_worlds
-from orchestrator.learning.calibration.active_design import ActivePours
-from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta, TriedOnPours
+from orchestrator.learning.calibration.active_design import ActiveDesign
+from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta, TriedOnAll
 from orchestrator.learning.calibration.calibration_scores import (
     DRAWS,
     UNCALIBRATED,
@@ -29,7 +29,7 @@ from orchestrator.learning.calibration.calibration_scores import (
     random_parameters,
     recommended_theta,
 )
-from orchestrator.learning.calibration.pour_design import DesignedPours, DesignPoured
+from orchestrator.learning.calibration.pour_design import DesignResult, StratifiedDesign
 from orchestrator.learning.campaign_plan import (
     CalibrationEvidence,
     CalibrationPlan,
@@ -203,8 +203,8 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
 
         def pours(results: Results, seed: int) -> Strategy:
             if plan.design == "active":
-                return ActivePours(plan, deployment, seed)
-            return DesignedPours(
+                return ActiveDesign(plan, deployment, seed)
+            return StratifiedDesign(
                 plan.scenes,
                 plan.actions,
                 plan.pour_count,
@@ -239,7 +239,7 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
             trials=[
                 (trial.theta, trial.differences)
                 for trial in result_of(results, CALIBRATION, Calibrated).trials
-                if isinstance(trial, TriedOnPours)
+                if isinstance(trial, TriedOnAll)
             ],
         )
 
@@ -466,7 +466,7 @@ def calibrated_theta(results: Results) -> CalibratedTheta:
 def measured_pours(plan: CalibrationPlan, results: Results) -> list[ScoredPour]:
     """Weighed pours of the calibration's scene: from the stage that made them, and from the records."""
     scored, scenes = [], {scene.name: scene for scene in plan.poured}
-    for pour in result_of(results, POURS, DesignPoured).measured if POURS in results else ():
+    for pour in result_of(results, POURS, DesignResult).measured if POURS in results else ():
         scene = scenes.get(pour.scene, plan.scene)
         action = scene.action(dict(pour.action_si))
         measured = MeasuredPour(action, pour.spillage, pour.poured, pour.split, scene.name)
@@ -478,7 +478,7 @@ def known_simulations(plan: CalibrationPlan, results: Results) -> tuple[KnownSim
     """Simulations in the calibration's scenes by the stage that made the pours; the plan's without such a stage."""
     if POURS not in results:
         return plan.known
-    simulated = result_of(results, POURS, DesignPoured).simulated
+    simulated = result_of(results, POURS, DesignResult).simulated
     scenes = {scene.name: scene for scene in plan.scenes}
     return tuple(
         KnownSimulation(dict(run.theta), run.scene, scenes[run.scene].action(dict(run.action_si)), run.spillage)

@@ -15,10 +15,10 @@ import numpy as np
 
 from orchestrator.campaigns.run_snapshot import record_of
 from orchestrator.learning.calibration.action_prior import Contexts, region_of
-from orchestrator.learning.calibration.active_design import ActivePours
+from orchestrator.learning.calibration.active_design import ActiveDesign
 from orchestrator.learning.calibration.calibration_scores import CalibrationEvaluation
 from orchestrator.learning.calibration.pointwise_calibration import C1Settings
-from orchestrator.learning.calibration.pour_design import DesignedPours, DesignPoured, draw_allowed, stratified
+from orchestrator.learning.calibration.pour_design import DesignResult, StratifiedDesign, draw_allowed, stratified
 from orchestrator.learning.campaign_plan import CampaignPlan, OutputSettings, RecordedPour, RecordSet
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.deployment_result import Deployed
@@ -130,9 +130,11 @@ def _pours(study: StudyPlan, campaign: CampaignPlan, cell: StudyCell, seed: int)
     plan = campaign.calibration
     assert plan is not None
     if cell.strategy:
-        return ActivePours(plan, campaign.deployment, seed)
+        return ActiveDesign(plan, campaign.deployment, seed)
     points = calibration_actions(study)
-    return DesignedPours(plan.scenes, plan.actions, len(points), study.holdout, seed, points=points, tested=plan.tested)
+    return StratifiedDesign(
+        plan.scenes, plan.actions, len(points), study.holdout, seed, points=points, tested=plan.tested
+    )
 
 
 def _with_pours(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load, directory: Path) -> CampaignPlan:
@@ -143,10 +145,10 @@ def _with_pours(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Loa
     mass, pours = calibration.scene.liquid.mass, []
     scenes = {scene.name: scene for scene in calibration.poured}
     count = study.calibration(cell.strategy).pours if cell.strategy else 0
-    weighed = result_of(load(cell.needs[0]), POURS, DesignPoured).measured
+    weighed = result_of(load(cell.needs[0]), POURS, DesignResult).measured
     if count:
         chosen = load(cell.needs[1])
-        weighed = (*result_of(chosen, POURS, DesignPoured).measured, *(p for p in weighed if p.split == "test"))
+        weighed = (*result_of(chosen, POURS, DesignResult).measured, *(p for p in weighed if p.split == "test"))
         calibration = replace(calibration, known=known_simulations(calibration, chosen))
     for pour in weighed:
         poured, scene = pour.poured * mass, scenes.get(pour.scene, calibration.scene)

@@ -27,7 +27,7 @@ from orchestrator.records.codec import result_of
 from orchestrator.runs.stages import CALIBRATION, EVALUATION
 from orchestrator.study.study_folder import CellResult
 from orchestrator.study.study_plan import FINAL, StudyPlan, cells_of
-from orchestrator.study.study_strategies import FinalPoured
+from orchestrator.study.study_strategies import FinalResult
 
 RANDOM = "random θ"
 """Label of the random θ of a study, which count as one strategy."""
@@ -141,7 +141,7 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
             pooled.numbers.setdefault(key, []).append(cell.repetition)
         elif cell.kind == "final":
             key = Key(cell.level, receivers[cell.receiver], cell.strategy)
-            final = result_of(data.results, FINAL, FinalPoured)
+            final = result_of(data.results, FINAL, FinalResult)
             pour = Final(final.loss, 1.0 if final.spillage is None else final.spillage, final.made)
             pooled.finals.setdefault(key, {}).setdefault(cell.repetition, []).append(pour)
     pooled.calibrated = {name: pooled.calibrated[name] for name in order if name in pooled.calibrated}

@@ -31,7 +31,7 @@ class Tabled(StageResult):
     """Number of simulations with an answer."""
 
 
-class FinalPoured(StageResult):
+class FinalResult(StageResult):
     """A pour of the action that a deployment recommends, with a seed that was not used for its selection."""
 
     kind: Literal["final"] = "final"
@@ -171,7 +171,7 @@ class FinalPour:
         self._costing = costing
         self._action = action
         self._pour = None if action is None else OnePour(costing.scene, action, seed)
-        self._made: FinalPoured | None = None if action is not None else self._lost("nothing was recommended")
+        self._made: FinalResult | None = None if action is not None else self._lost("nothing was recommended")
         self.decisions: list[Decision] = [] if self._pour is None else self._pour.decisions
 
     @property
@@ -192,7 +192,7 @@ class FinalPour:
             case Poured(measurement) if is_sound(measurement.fractions):
                 loss = self._costing.poured(measurement, self._action)
                 spillage = measurement.fractions.spillage
-                self._made = FinalPoured(
+                self._made = FinalResult(
                     action_si=self._action.values(),
                     loss=loss,
                     spillage=spillage,
@@ -208,13 +208,13 @@ class FinalPour:
         """Pours done, and their total number."""
         return Progress(pours=int(self.finished), of_pours=1)
 
-    def result(self) -> FinalPoured:
+    def result(self) -> FinalResult:
         """The outcome; until there is one, the result of a lost pour."""
         return self._lost("it has not been poured yet") if self._made is None else self._made
 
-    def _lost(self, reason: str) -> FinalPoured:
+    def _lost(self, reason: str) -> FinalResult:
         action = None if self._action is None else self._action.values()
-        return FinalPoured(action_si=action, loss=self._costing.worst, spillage=None, made=False, reason=reason)
+        return FinalResult(action_si=action, loss=self._costing.worst, spillage=None, made=False, reason=reason)
 
 
 def _key(request: Simulate) -> Key:

@@ -275,7 +275,7 @@ def test_what_was_measured_of_the_daemon_stands_on_its_page() -> None:
 def test_doses_with_gaps_stay_within_their_tolerance(of: str, seed: int) -> None:
     import dosing_gaps
 
-    for dose in dosing_gaps.pour_series(of, seed):
+    for dose in dosing_gaps.loss_series(of, seed):
         assert dose.error < 1.0
         assert dose.end in (DoseEnd.REACHED, DoseEnd.MISSED)
 
@@ -283,8 +283,8 @@ def test_doses_with_gaps_stay_within_their_tolerance(of: str, seed: int) -> None
 def test_a_pause_of_the_commands_does_not_mislead_the_next_dose() -> None:
     """Readings that were late while the arm turned back by itself were taken for a stream: 13 g too much in the next
     dose."""
-    from dosing_gaps import pour_series
+    from dosing_gaps import loss_series
 
-    first, second = pour_series("commands", 71332)
+    first, second = loss_series("commands", 71332)
     assert abs(first.error) < 2.0
     assert abs(second.error) < 2.0

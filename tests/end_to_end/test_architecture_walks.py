@@ -153,9 +153,16 @@ def test_a_stop_reaches_the_arm_through_the_listed_files(tmp_path: Path, monkeyp
 
 
 DECISIONS = {
-    *{"Deployment.tell", "DeploymentLedger._settle", "PourTrial.take", "Hybrid._next", "PourChoice.query", "fit"},
+    *{
+        "Deployment.tell",
+        "DeploymentLedger._settle",
+        "DeploymentTrial.take",
+        "Hybrid._next",
+        "ActionChoice.query",
+        "fit",
+    },
     *{"GaussianProcess.__init__", "ModelAveragedProcess.__init__", "Region.draw", "minimise", "looked_ahead"},
-    *{"least_loss", "PourChoice.judge", "Deployment._pour"},
+    *{"least_loss", "ActionChoice.judge", "Deployment._pour"},
 }
 
 

@@ -29,7 +29,7 @@ from orchestrator.learning.requests import (
     Suggest,
     Suggested,
 )
-from orchestrator.learning.single_action import PredictedPour
+from orchestrator.learning.single_action import ActionPrediction
 from orchestrator.learning.strategy import Progress, Strategy
 from orchestrator.records.events import (
     CampaignClosed,
@@ -65,7 +65,7 @@ ACTIONS = Space((Axis("angular_velocity", 15 * DEG, 120 * DEG), Axis("x_offset",
 THETA = Space((Axis("particles", 500, 4000, "log", integer=True), Axis("cohesion", 0.0, 0.1)))
 ACTION = Action(angular_velocity=40 * DEG, x_offset=0.09, height=0.05)
 PARTICLES = 300
-LEARNT = PredictedPour(scene="narrow cup", simulations=0, simulations_lost=0, thetas=0, touching=0, over_seeds={})
+LEARNT = ActionPrediction(scene="narrow cup", simulations=0, simulations_lost=0, thetas=0, touching=0, over_seeds={})
 """For events whose result nobody looks at."""
 
 

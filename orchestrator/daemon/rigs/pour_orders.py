@@ -448,7 +448,7 @@ def weighed_result(order: PourOrder, measured: PourMeasurement, deviation: float
 
 
 @dataclass(frozen=True)
-class SettledPour:
+class SettledOrder:
     """A pour as its journal records it, with the deviation of one weighing [kg]."""
 
     order: PourOrder
@@ -456,7 +456,7 @@ class SettledPour:
     deviation: float
 
 
-def settled_pour(run: Path, snapshot: Path, rig: Rig) -> SettledPour | None:
+def settled_pour(run: Path, snapshot: Path, rig: Rig) -> SettledOrder | None:
     """Read the pour of an order from the journal of its run. Reads files; don't call it in an event loop.
 
     Args:
@@ -473,7 +473,7 @@ def settled_pour(run: Path, snapshot: Path, rig: Rig) -> SettledPour | None:
     pours = read_record(run).pours
     if not pours:
         return None
-    return SettledPour(
+    return SettledOrder(
         PourOrder.read(snapshot), pours[0], weighing_deviation(rig.spec or load_laboratory(shipped(VIRTUAL)))
     )
 
@@ -523,7 +523,7 @@ class OrderBook:
             None if predicted is None else json.dumps(predicted),
         )
 
-    def settle(self, item: QueueItem, settled: SettledPour | None, *, ended: bool) -> None:
+    def settle(self, item: QueueItem, settled: SettledOrder | None, *, ended: bool) -> None:
         """Enter the outcome of a pour in the account and store its result. A second call changes nothing.
 
         Args:

@@ -27,7 +27,7 @@ from orchestrator.daemon.state.daemon_settings import NO_RIG, DaemonSettings, Ri
 from orchestrator.daemon.state.daemon_store import ENDED, PAUSED, STOPPED, DesiredState, QueueItem, Store
 from orchestrator.daemon.state.event_feed import Feed
 from orchestrator.daemon.state.notifications import Counts
-from orchestrator.daemon.state.run_readout import Pours, found_at, prune_recordings, verdict_at
+from orchestrator.daemon.state.run_readout import RunReadouts, found_at, prune_recordings, verdict_at
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.requests import Pour
 from orchestrator.learning.run_errors import RunError
@@ -83,7 +83,7 @@ class SharedServices:
         self.problems: dict[str, str] = {}
         self.token_problems: Callable[[], list[str]] = list
         self.notification_counts: dict[str, Counts] = {}
-        self.pours = Pours()
+        self.pours = RunReadouts()
         self.counted: Counter[tuple[str, str, str]] = Counter()
         self._begun: dict[str, str] = {}
         self._asked: set[str] = set()

@@ -1,6 +1,6 @@
 """Reads run folders and benches for the API; every function may take seconds and must not run in an event loop.
 
-- `Pours`, `summary_of` and `verdict_at` read the pours, the summary and the verdict of a run.
+- `RunReadouts`, `summary_of` and `verdict_at` read the pours, the summary and the verdict of a run.
 - `found_at` reads the arm and the balance after a crash, for the operator who decides the outcome of a pour. Nothing is
   moved or tared.
 - `violated_charts` reads the control charts that are out of control.
@@ -37,7 +37,7 @@ from orchestrator.reports.mixture_report import draw_rack, mixed_liquids, mixtur
 from orchestrator.reports.run_summary import PourSummary
 from orchestrator.reports.summarise import pour_summaries
 
-__all__ = ["REPORT", "Pours", "summary_of"]
+__all__ = ["REPORT", "RunReadouts", "summary_of"]
 
 _log = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ def violated_charts(state: Path) -> list[LaboratoryChart]:
         return [chart for chart in catalogue.charts({}) if chart.lasting is not None]
 
 
-class Pours:
+class RunReadouts:
     """Pours of runs. Each journal is read from its last position, since pages query again at every event.
 
     May be called from several threads.

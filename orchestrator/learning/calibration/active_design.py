@@ -1,6 +1,6 @@
 """Active design of calibration pours: each pour is chosen by its expected information about deployment.
 
-`ActivePours` is the strategy; `joint_contexts` builds the space of its surrogate. The variance reduction is calculated
+`ActiveDesign` is the strategy; `joint_contexts` builds the space of its surrogate. The variance reduction is calculated
 in `actors.optimizer.theta_posterior`.
 """
 
@@ -22,7 +22,7 @@ from actors.optimizer.questions import (
 from orchestrator.learning.calibration.action_prior import Contexts, actions_of_prior
 from orchestrator.learning.calibration.campaign_memory import unit_memory
 from orchestrator.learning.calibration.posterior_summary import unit_prior
-from orchestrator.learning.calibration.pour_design import DesignedPours, DesignPoured, SimulatedPoint, Stratum
+from orchestrator.learning.calibration.pour_design import DesignResult, SimulatedPoint, StratifiedDesign, Stratum
 from orchestrator.learning.campaign_plan import CalibrationPlan, DeploymentPlan, NormalPrior
 from orchestrator.learning.requests import Decision, Failed, Outcome, Request, Simulate, Simulated, Slots, Suggest
 from orchestrator.learning.strategy import Progress, is_sound
@@ -63,7 +63,7 @@ class ContextPlace:
     chosen: Point
 
 
-class ActivePours(DesignedPours):
+class ActiveDesign(StratifiedDesign):
     """Weigh the pours that are most informative about deployment: simulate first, then choose pour by pour.
 
     A surrogate of the simulated spillage over θ, actions and receivers is fitted to `design_simulations` simulations.
@@ -254,7 +254,7 @@ class ActivePours(DesignedPours):
         ]
         self._candidates = others or [place for place in self._candidates if place is not failed] or self._candidates
 
-    def result(self) -> DesignPoured:
+    def result(self) -> DesignResult:
         """The pours so far in the order made, and the simulations that calibration can also use."""
         poured, names = {scene.name for scene in self._plan.scenes}, self._plan.actions.names
         simulated = []

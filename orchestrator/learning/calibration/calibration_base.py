@@ -1,7 +1,7 @@
 """Base of the calibration strategies, with their results and the settings that they share.
 
 - `Calibration` makes the requests, records the outcomes, drops failed simulations and reports θ*.
-- `Calibrated` is the result; `TriedOnPours` and `TriedOnce` describe one θ each.
+- `Calibrated` is the result; `TriedOnAll` and `TriedOnce` describe one θ each.
 - `DesignSettings` derives the number of θ of C1 to C3 and checks it against the budget of simulations.
 
 The choice of the next θ belongs to the subclasses.
@@ -57,7 +57,7 @@ class CalibrationTrial(ResultPart):
     """Mean |r − c_s|, or |r − c_s| of a single action; None if nothing could be compared."""
 
 
-class TriedOnPours(CalibrationTrial):
+class TriedOnAll(CalibrationTrial):
     """C1 to C3: a θ that was simulated on every training pour."""
 
     defined: int
@@ -128,7 +128,7 @@ class Calibrated(StageResult):
     training_pours: int
     """Number of weighed pours that were used for training."""
 
-    trials: tuple[TriedOnPours | TriedOnce, ...]
+    trials: tuple[TriedOnAll | TriedOnce, ...]
     """Every θ with all answers, in request order."""
 
     found: CalibratedTheta | None = None
@@ -282,7 +282,7 @@ class Calibration(ABC, Generic[S]):
         return Progress(self._trials.answered, self._budget)
 
     @abstractmethod
-    def _row(self, number: int, trial: Trial) -> TriedOnPours | TriedOnce:
+    def _row(self, number: int, trial: Trial) -> TriedOnAll | TriedOnce:
         """Convert a trial to its row in the result."""
 
     def _contradicts(self, posterior: Posterior) -> bool:

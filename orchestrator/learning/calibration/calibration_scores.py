@@ -24,8 +24,8 @@ from pydantic import Field
 from orchestrator.learning.calibration.action_prior import Contexts
 from orchestrator.learning.calibration.pointwise_calibration import LEAST_DEFINED
 from orchestrator.learning.calibration.pour_residuals import (
-    PourResidual,
-    SimulatedPour,
+    ResidualPair,
+    SpillageResidual,
     WithoutMisfits,
     misfit_sentence,
     pour_residuals,
@@ -138,7 +138,7 @@ class Scores(StageResult):
     gain: CalibrationGain | None = None
     """Comparison with the uncalibrated θ; None if θ* was not compared with it."""
 
-    pours: tuple[PourResidual, ...] = ()
+    pours: tuple[SpillageResidual, ...] = ()
     """Every weighed pour with its residual, once all are simulated."""
 
     without: WithoutMisfits | None = None
@@ -505,7 +505,7 @@ class CalibrationEvaluation:
             self._pours.setdefault(scored.pour.split, []).append(scored.pour)
         self._baselines: tuple[BySplit, BySplit] | None = None
         self._gain: CalibrationGain | None = None
-        self._residuals: tuple[PourResidual, ...] = ()
+        self._residuals: tuple[SpillageResidual, ...] = ()
         self._without: WithoutMisfits | None = None
 
     @property
@@ -542,7 +542,7 @@ class CalibrationEvaluation:
             return
         simulated = self._calibrated.simulated()
         self._residuals = pour_residuals(
-            [SimulatedPour(scored.pour, scored.scene, simulated.get(id(scored))) for scored in self._scored],
+            [ResidualPair(scored.pour, scored.scene, simulated.get(id(scored))) for scored in self._scored],
             self._theta.particles,
         )
         self._without = without_misfits(self._residuals, self._trials)

@@ -22,7 +22,7 @@ from orchestrator.learning.calibration.calibration_base import (
     Calibration,
     DesignSettings,
     Kappa,
-    TriedOnPours,
+    TriedOnAll,
     check_initial,
     described,
 )
@@ -133,11 +133,11 @@ class DiscrepancyOverPours(Calibration[S]):
     def _mapped(self, suggestion: Suggestion) -> None:
         self._final = suggestion
 
-    def _row(self, number: int, trial: Trial) -> TriedOnPours:
+    def _row(self, number: int, trial: Trial) -> TriedOnAll:
         differences = discrepancies(trial)
         costs = {trial.requests[i].seed: cost for i, cost in trial.costs.items()}
         by_pour = [costs.get(seed) for seed in self._seed_of_pour]
-        return TriedOnPours(
+        return TriedOnAll(
             theta=self._values(trial.point),
             discrepancy=self._score(trial),
             defined=len(differences),

@@ -1,7 +1,7 @@
 """Stratified design of calibration pours, requested one by one.
 
-- `stratified` and `choose_holdout` build the design; `DesignedPours` is the strategy that weighs it.
-- `DesignPoured` is the result.
+- `stratified` and `choose_holdout` build the design; `StratifiedDesign` is the strategy that weighs it.
+- `DesignResult` is the result.
 
 `active_design` derives pours from this design that are chosen by their information instead.
 """
@@ -106,7 +106,7 @@ class DesignPoint(ResultPart):
     """Name of the scene; '' for the calibration's first scene."""
 
 
-class PouredPoint(DesignPoint):
+class WeighedPoint(DesignPoint):
     """A pour that was weighed."""
 
     action: dict[str, float | None]
@@ -148,21 +148,21 @@ class SimulatedPoint(ResultPart):
     """Simulated spillage c_s = spilled / poured."""
 
 
-class DesignPoured(StageResult):
+class DesignResult(StageResult):
     """The pours that calibration learns from."""
 
     kind: Literal["pours"] = "pours"
 
-    pours: tuple[PouredPoint | GivenUpPoint, ...]
+    pours: tuple[WeighedPoint | GivenUpPoint, ...]
     """The pours in the order made."""
 
     simulated: tuple[SimulatedPoint, ...] = ()
     """Simulations of an active design in the calibration's scenes."""
 
     @property
-    def measured(self) -> tuple[PouredPoint, ...]:
+    def measured(self) -> tuple[WeighedPoint, ...]:
         """The pours that were weighed."""
-        return tuple(pour for pour in self.pours if isinstance(pour, PouredPoint))
+        return tuple(pour for pour in self.pours if isinstance(pour, WeighedPoint))
 
 
 @dataclass
@@ -194,7 +194,7 @@ class _Planned:
                 raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
 
 
-class DesignedPours:
+class StratifiedDesign:
     """Weigh a stratified set of pours: two actions from each of 4×4 strata, as in the paper, or a Latin hypercube.
 
     An invalid action (touching vessels) is replaced by another one of its stratum. A stratum without a possible action
@@ -299,9 +299,9 @@ class DesignedPours:
         """Pours done, and their total number."""
         return Progress(pours=self._current, of_pours=len(self._planned))
 
-    def result(self) -> DesignPoured:
+    def result(self) -> DesignResult:
         """The pours so far, in the order made."""
-        rows: list[PouredPoint | GivenUpPoint] = []
+        rows: list[WeighedPoint | GivenUpPoint] = []
         for number, planned in enumerate(self._planned[: self._current], start=1):
             if planned.measured is None:
                 rows.append(
@@ -313,7 +313,7 @@ class DesignedPours:
             action = planned.measured.action
             values = {name: getattr(action, name) for name in self._actions.names}
             rows.append(
-                PouredPoint(
+                WeighedPoint(
                     number=number,
                     split=planned.split,
                     scene=planned.scene.name,
@@ -324,4 +324,4 @@ class DesignedPours:
                     invalid_tries=len(planned.notes),
                 )
             )
-        return DesignPoured(pours=tuple(rows))
+        return DesignResult(pours=tuple(rows))

@@ -34,7 +34,7 @@ _MAD = 1.0 / _NORMAL.inv_cdf(0.75)
 """Standard deviation of a normal distribution by its median absolute deviation."""
 
 
-class PourResidual(ResultPart):
+class SpillageResidual(ResultPart):
     """A weighed pour with its simulation by θ*, as shares of the poured liquid."""
 
     number: int
@@ -96,7 +96,7 @@ class WithoutMisfits(ResultPart):
 
 
 @dataclass(frozen=True)
-class SimulatedPour:
+class ResidualPair:
     """A weighed pour and its simulation with θ*.
 
     Attributes:
@@ -109,7 +109,7 @@ class SimulatedPour:
     simulated: float | None
 
 
-def pour_residuals(pours: Sequence[SimulatedPour], particles: int) -> tuple[PourResidual, ...]:
+def pour_residuals(pours: Sequence[ResidualPair], particles: int) -> tuple[SpillageResidual, ...]:
     """Residuals of all pours with a spillage.
 
     The scale of a pour's interval is the median of the *other* training pours' shifts, so that it does not hide itself;
@@ -136,7 +136,7 @@ def pour_residuals(pours: Sequence[SimulatedPour], particles: int) -> tuple[Pour
             low, high = (_NORMAL.cdf(place + side * half) + side * WEIGHING for side in (-1.0, 1.0))
             low, high = max(low, 0.0), min(high, 1.0)
         residuals.append(
-            PourResidual(
+            SpillageResidual(
                 number=i + 1,
                 line=pour.line,
                 split=pour.split,
@@ -155,7 +155,7 @@ def pour_residuals(pours: Sequence[SimulatedPour], particles: int) -> tuple[Pour
 
 
 def without_misfits(
-    residuals: Sequence[PourResidual], trials: Sequence[tuple[Mapping[str, float], Sequence[float | None]]]
+    residuals: Sequence[SpillageResidual], trials: Sequence[tuple[Mapping[str, float], Sequence[float | None]]]
 ) -> WithoutMisfits | None:
     """θ* without the training pours that do not fit; None if all fit, or no θ was simulated on all others.
 
@@ -184,7 +184,7 @@ def without_misfits(
     )
 
 
-def misfit_sentence(residuals: Sequence[PourResidual], without: WithoutMisfits | None) -> str:
+def misfit_sentence(residuals: Sequence[SpillageResidual], without: WithoutMisfits | None) -> str:
     """Names the pours that do not fit and what θ* would be without them; '' if all fit."""
     misfits = [pour for pour in residuals if pour.fits is False and pour.split != "transfer"]
     if not misfits:

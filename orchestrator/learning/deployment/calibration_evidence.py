@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from actors.optimizer.questions import CalibrationPours
+from actors.optimizer.questions import SceneEvidence
 from orchestrator.learning.calibration.calibration_scores import (
     CALIBRATED,
     UNCALIBRATED,
@@ -161,7 +161,7 @@ def _evidence(
         lines.append(f"not used: {len(near) - count} {into}: {MOST_POURS} of them are enough")
     if outside := len(pairs) - len(near):
         lines.append(f"not used: {outside} {into}: far from the deployment's actions")
-    return CalibrationEvidence((CalibrationPours(points, costs, simulated, power, misled),), tuple(lines))
+    return CalibrationEvidence((SceneEvidence(points, costs, simulated, power, misled),), tuple(lines))
 
 
 def _cost(costing: Costing, pair: WeighedPair, spillage: float) -> float:

@@ -15,7 +15,7 @@ from orchestrator.learning.deployment.deployment_base import MAP_RESOLUTION, Dep
 from orchestrator.learning.deployment.deployment_ledger import SearchSettings
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import RiskLimitSettings, Rules, StopSettings
-from orchestrator.learning.deployment.pour_choice import PourChoice
+from orchestrator.learning.deployment.pour_choice import ActionChoice
 from orchestrator.learning.requests import Decision
 from orchestrator.learning.strategy import Progress, Strategy, plural
 from sim_engine.liquids import SimulationParameters
@@ -140,7 +140,7 @@ class Hybrid(Deployment[D3Settings]):
         super().__init__(plan, scene, parameters, seed)
         simulated = partial(self._ledger.simulated, everything=True)
         rules = self._settings.rules(self._ledger.costing.worst)
-        self._choice = PourChoice(self._requests, simulated, rules)
+        self._choice = ActionChoice(self._requests, simulated, rules)
         self._before = self._settings.prior_simulations
         self._found_at: int | None = None
 

@@ -16,7 +16,7 @@ from actors.optimizer.questions import Data, Equality, Point, SpaceFillingQuery,
 from orchestrator.learning.calibration.calibration_base import Kappa
 from orchestrator.learning.campaign_plan import DeploymentPlan, DeploymentSettings
 from orchestrator.learning.deployment.costing import Costing
-from orchestrator.learning.deployment.real_pours import PourTrial, point_of, prior_pours
+from orchestrator.learning.deployment.real_pours import DeploymentTrial, point_of, prior_pours
 from orchestrator.learning.requests import ADDED, Decision, Failed, Outcome, Pour, Prediction, Request, Simulate
 from orchestrator.learning.trials import SeedStream, Trials
 from sim_engine.action import Action, described
@@ -70,8 +70,8 @@ class DeploymentLedger:
         self.plan, self.scene = plan, scene
         self.costing = Costing.of(plan, scene, parameters)
         self.trials = Trials()
-        self.pours: list[PourTrial] = []
-        self.added: list[PourTrial] = []
+        self.pours: list[DeploymentTrial] = []
+        self.added: list[DeploymentTrial] = []
         self.decisions: list[Decision] = []
         data = plan.data if plan.settings.learns_on_pours else None
         self.former = () if data is None else prior_pours(data, scene, plan.actions, self.costing)
@@ -89,11 +89,11 @@ class DeploymentLedger:
         else:
             self.trials.settle(request, self.costing.of_theta(request.parameters).simulated(outcome, request.action))
 
-    def begin(self, point: Point, predicted: Prediction | None) -> PourTrial:
+    def begin(self, point: Point, predicted: Prediction | None) -> DeploymentTrial:
         """Enter a pour that is about to be requested."""
         noise = 0.0 if predicted is None or predicted.scatter is None else predicted.scatter
         number = self._former_counted + len(self.pours) + 1
-        self.pours.append(PourTrial(number, point, self.plan.actions.decode(point), predicted, noise))
+        self.pours.append(DeploymentTrial(number, point, self.plan.actions.decode(point), predicted, noise))
         return self.pours[-1]
 
     def take(self, outcome: Outcome) -> None:
@@ -113,7 +113,7 @@ class DeploymentLedger:
         self.decisions.append(Decision(f"pour {number} is corrected"))
         self._settle(answered[-1], outcome)
 
-    def _settle(self, trial: PourTrial, outcome: Outcome) -> None:
+    def _settle(self, trial: DeploymentTrial, outcome: Outcome) -> None:
         trial.take(outcome, self.scene, self.costing, penalised=True)
         if trial.status == "weighed" and trial.cost is not None:
             self.decisions.append(Decision(f"pour {trial.number}: loss {trial.cost:.4g}", {"loss": trial.cost}))
@@ -127,7 +127,7 @@ class DeploymentLedger:
         if request.purpose != ADDED:
             raise ValueError(f"this pour was not asked for: {request}")
         values = {name: float(getattr(request.action, name)) for name in self.plan.actions.names}
-        trial = PourTrial(0, point_of(request.action, self.plan.actions), values, None, 0.0)
+        trial = DeploymentTrial(0, point_of(request.action, self.plan.actions), values, None, 0.0)
         trial.take(outcome, self.scene, self.costing, penalised=False)
         if trial.cost is not None:
             trial.status = "added"

@@ -7,7 +7,7 @@ from typing import Literal
 
 from actors.optimizer.questions import Suggestion
 from orchestrator.learning.deployment.model_monitoring import Believed, BenchFound
-from orchestrator.learning.deployment.real_pours import PourRow, PredictionCheck
+from orchestrator.learning.deployment.real_pours import DeploymentRow, PredictionCheck
 from orchestrator.learning.stage_result import DisplayedMap, ResultPart, StageResult, displayed_action
 from sim_engine.prediction_band import SampleStatistics
 from sim_engine.search_space import Space
@@ -110,7 +110,7 @@ class Deployed(StageResult):
     simulations_refused: int
     """Number of actions refused before the simulation."""
 
-    pours: tuple[PourRow, ...]
+    pours: tuple[DeploymentRow, ...]
     """All completed pours, in the order made."""
 
     simulated: tuple[SimulatedAction, ...]
@@ -144,11 +144,11 @@ class Deployed(StageResult):
     """The recommended action; None before the end, and without any usable outcome."""
 
     @property
-    def weighed(self) -> Sequence[PourRow]:
+    def weighed(self) -> Sequence[DeploymentRow]:
         """Weighed pours with a loss."""
         return [pour for pour in self.pours if pour.status == "weighed" and pour.loss is not None]
 
     @property
-    def best(self) -> PourRow | None:
+    def best(self) -> DeploymentRow | None:
         """The pour with the least loss."""
         return min(self.weighed, key=lambda pour: pour.loss or 0.0, default=None)

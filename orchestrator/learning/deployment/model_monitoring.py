@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
 from actors.optimizer.questions import BenchOffset, DiscrepancyFound, Limit, OffsetPrior, Suggestion
-from orchestrator.learning.deployment.real_pours import PourTrial
+from orchestrator.learning.deployment.real_pours import DeploymentTrial
 from orchestrator.learning.requests import Decision
 from orchestrator.learning.stage_result import ResultPart
 from sim_engine.action import ACTION_DIMENSIONS, DEG
@@ -150,7 +150,7 @@ class SimulatorMonitor:
 
     # -- what is logged --------------------------------------------------------------------------------------------
 
-    def record(self, latest: DiscrepancyFound, pours: Sequence[PourTrial]) -> None:
+    def record(self, latest: DiscrepancyFound, pours: Sequence[DeploymentTrial]) -> None:
         """Record the conclusions of an answer, and log those of the latest pour."""
         weighed = [pour for pour in pours if pour.cost is not None]
         number = weighed[-1].number if weighed else 0
@@ -200,7 +200,7 @@ class SimulatorMonitor:
 
     # -- decisions ----------------------------------------------------------------------------------------------
 
-    def judge(self, suggestion: Suggestion, pours: Sequence[PourTrial], left: int) -> str:
+    def judge(self, suggestion: Suggestion, pours: Sequence[DeploymentTrial], left: int) -> str:
         """Decide whether the proposed pour is made: the reason why no pour follows, or an empty text.
 
         Args:

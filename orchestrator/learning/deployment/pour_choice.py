@@ -16,7 +16,7 @@ from orchestrator.learning.deployment.model_monitoring import Rules, SimulatorMo
 from orchestrator.learning.requests import Decision
 
 
-class PourChoice:
+class ActionChoice:
     """Chooses the real pours of D3.
 
     Args:

@@ -1,6 +1,6 @@
 """Real pours of a deployment: their records, their conversion to data, and a check of their predictions.
 
-- `PourTrial` is a pour with its prediction and outcome; `PourRow` is its form in results.
+- `DeploymentTrial` is a pour with its prediction and outcome; `DeploymentRow` is its form in results.
 - `prior_pours` converts pours from before the campaign.
 - `trust` compares the first pours with their predictions.
 - `scaled_interval` corrects the width of a prediction interval by the deviations of earlier pours.
@@ -41,7 +41,7 @@ LARGEST_Z = 3.0
 Status = Literal["pouring", "weighed", "refused", "failed", "added"]
 
 
-class PourRow(WeighedMasses):
+class DeploymentRow(WeighedMasses):
     """A real pour of a deployment: its action, its prediction and its outcome."""
 
     number: int
@@ -90,7 +90,7 @@ class PredictionCheck(ResultPart):
 
 
 @dataclass
-class PourTrial:
+class DeploymentTrial:
     """A real pour: its action, its prediction and its outcome.
 
     Attributes:
@@ -141,10 +141,10 @@ class PourTrial:
         if self.status == "failed" and penalised:
             self.cost = costing.worst
 
-    def row(self, liquid: Liquid) -> PourRow:
+    def row(self, liquid: Liquid) -> DeploymentRow:
         """The pour's form in results."""
         weighed, predicted = self.measurement, self.predicted
-        return PourRow(
+        return DeploymentRow(
             number=self.number,
             status=self.status,
             reason=self.reason,
@@ -188,7 +188,7 @@ def point_of(action: Action, actions: Space) -> Point:
     return tuple(min(max(float(u), 0.0), 1.0) for u in unit)
 
 
-def scaled_interval(prediction: Prediction, earlier: Sequence[PourTrial], worst: float) -> tuple[float, float]:
+def scaled_interval(prediction: Prediction, earlier: Sequence[DeploymentTrial], worst: float) -> tuple[float, float]:
     """The prediction interval of a pour, scaled by the deviations of the campaign's earlier pours.
 
     The factor is the root mean square of their z, (loss − predicted mean) / predicted standard deviation (of a single
@@ -208,7 +208,7 @@ def scaled_interval(prediction: Prediction, earlier: Sequence[PourTrial], worst:
     return begin, worst if high >= worst else min(mean + factor * (high - mean), worst)
 
 
-def _z_scores(pours: Sequence[PourTrial]) -> list[float]:
+def _z_scores(pours: Sequence[DeploymentTrial]) -> list[float]:
     """Loss minus predicted mean of the pours that have both, in standard deviations of a single pour."""
     return [
         (trial.cost - trial.predicted.mean) / max(math.hypot(trial.predicted.deviation, trial.noise), 1e-9)
@@ -217,7 +217,7 @@ def _z_scores(pours: Sequence[PourTrial]) -> list[float]:
     ]
 
 
-def trust(weighed: Sequence[PourTrial]) -> PredictionCheck:
+def trust(weighed: Sequence[DeploymentTrial]) -> PredictionCheck:
     """Compare the first pours with their predictions, in predicted standard deviations (noise included).
 
     An inaccurate simulator makes D3 worse than no prior at all. The user is therefore warned.

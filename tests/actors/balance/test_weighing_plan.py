@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from actors.balance.balance_interface import BalanceError
-from actors.balance.weighing_plan import Placement, PourMasses, measurement, needed, weighing_uncertainty, weighings
+from actors.balance.weighing_plan import Placement, Weighing, measurement, needed, weighing_uncertainty, weighings
 
 GRAM = 1e-3
 EMPTY_POURER, EMPTY_RECEIVER, TRAY = 0.0873, 0.1421, 0.4096
@@ -33,7 +33,7 @@ def weighed(
         Placement.TARED: lambda: 0.0 if pourer else TRAY + (spilled if poured else 0.0),  # one or the other
         Placement.MANUAL: lambda: 0.0,
     }[placement]
-    readings: dict[str, PourMasses] = {}
+    readings: dict[str, Weighing] = {}
     poured = receiver_on = False
     for step in weighings(placement):
         pourer = EMPTY_POURER if step.about.startswith("dry_pourer") else 0.0
@@ -61,7 +61,7 @@ def weighed(
             tared = pan
             continue
         net = pan if step.by == "operator" else pan - tared
-        readings[step.key] = PourMasses(net + (changed or {}).get(step.key, 0.0), sigma)
+        readings[step.key] = Weighing(net + (changed or {}).get(step.key, 0.0), sigma)
     return readings
 
 
@@ -106,7 +106,7 @@ def test_a_missing_weighing_is_named_with_what_to_do_and_never_assumed(placement
 @pytest.mark.parametrize("placement", Placement)
 def test_a_weight_that_is_no_number_is_refused(placement):
     readings = weighed(placement, 0.2, 0.004, 0.01)
-    readings[next(iter(readings))] = PourMasses(float("nan"))
+    readings[next(iter(readings))] = Weighing(float("nan"))
     with pytest.raises(BalanceError, match="is not a weight"):
         measurement(placement, readings)
 
@@ -179,7 +179,7 @@ def test_steps_come_in_the_order_in_which_they_can_be_done(placement):
 
 @pytest.mark.parametrize("placement", Placement)
 def test_what_is_known_of_a_vessel_is_not_asked_again(placement):
-    known = {"pourer_empty": PourMasses(EMPTY_POURER)}
+    known = {"pourer_empty": Weighing(EMPTY_POURER)}
     assert "pourer_empty" not in [s.key for s in weighings(placement, known=known)]
     readings = {k: v for k, v in weighed(placement, 0.2, 0.004, 0.01).items() if k not in known}
     assert measurement(placement, readings | known).loaded == pytest.approx(0.2)

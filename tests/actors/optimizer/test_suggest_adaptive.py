@@ -13,13 +13,13 @@ from actors.optimizer.knowledge_gradient import predicted_minimum
 from actors.optimizer.prediction_intervals import highest_density_intervals
 from actors.optimizer.questions import (
     BenchOffset,
-    CalibrationPours,
     Data,
     Limit,
     MinimumQuery,
     ModelDiscrepancy,
     OffsetPrior,
     PourQuery,
+    SceneEvidence,
     SuggestionQuery,
 )
 from actors.optimizer.suggest import propose
@@ -81,7 +81,7 @@ POURED = [(0.47, 0.6), (0.3, 0.75), (0.42, 0.45), (0.2, 0.5)]
 def calibrated(weighed, power=0.4):
     """Twelve pours into another receiver, simulated as `cup`, and weighed as another function says."""
     points = np.random.default_rng(5).random((12, 2))
-    return (CalibrationPours(tuple(map(tuple, points)), tuple(weighed(points)), tuple(cup(points)), power),)
+    return (SceneEvidence(tuple(map(tuple, points)), tuple(weighed(points)), tuple(cup(points)), power),)
 
 
 def first_pour(calibration):
@@ -130,7 +130,7 @@ def test_pours_into_the_same_receiver_show_where_the_simulator_misses_and_anothe
     points = np.concatenate([np.random.default_rng(5).random((20, 2)), best])
     expected = {}
     for power in (1.0, 0.84):
-        pours = CalibrationPours(tuple(map(tuple, points)), tuple(spot(points)), tuple(cup(points)), power)
+        pours = SceneEvidence(tuple(map(tuple, points)), tuple(spot(points)), tuple(cup(points)), power)
         discrepancy = ModelDiscrepancy(PRIORS, pours_left=10, calibration=(pours,))
         expected[power] = float(averaged(asked(cup, [], discrepancy=discrepancy)).predict(best)[0][0])
     assert expected[1.0] == pytest.approx(spot(best)[0], rel=0.2)
@@ -156,7 +156,7 @@ def test_of_actions_that_look_alike_the_first_pour_is_the_one_that_is_safest_wit
         return 0.02 * (1.0 - x) + 1.0 - np.exp(-((6.0 * outside) ** 1.5))
 
     points = np.random.default_rng(5).random((12, 2))
-    known = (CalibrationPours(tuple(map(tuple, points)), tuple(gutter(points)), tuple(gutter(points)), 0.99),)
+    known = (SceneEvidence(tuple(map(tuple, points)), tuple(gutter(points)), tuple(gutter(points)), 0.99),)
     discrepancy = ModelDiscrepancy(PRIORS, pours_left=10, calibration=known)
     question = asked(gutter, [], acquisition="least_loss", discrepancy=discrepancy)
     chosen, without = propose(question), propose(replace(question, discrepancy=replace(discrepancy, calibration=None)))

@@ -24,7 +24,7 @@ from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli.campaign_commands import planning_request
-from orchestrator.learning.calibration.pour_design import DesignPoured
+from orchestrator.learning.calibration.pour_design import DesignResult
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.study.study_campaigns import campaign_of
@@ -65,7 +65,7 @@ def test_cells_of_a_study_are_kept_in_the_language_of_campaigns(name: str, tmp_p
             continue  # those read pours from a journal
         kinds.add((cell.kind, cell.strategy))
         stage = f"deployment:{cell.receiver.removeprefix('deployment-')}"
-        deployed, poured = Deployed.model_construct(recommended=None), DesignPoured.model_construct(pours=())
+        deployed, poured = Deployed.model_construct(recommended=None), DesignResult.model_construct(pours=())
         needed = {"pours": poured, "calibration": plans.calibrated(theta), stage: deployed}
         plan = campaign_of(study, cell, lambda other, needed=needed: needed, tmp_path / cell.id).campaign  # type: ignore[misc]
         assert reloaded(plan, tmp_path) == plan, cell.id

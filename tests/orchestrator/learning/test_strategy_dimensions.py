@@ -20,7 +20,7 @@ from orchestrator.learning.calibration.pointwise_calibration import (
     StratifiedSampling,
     UniformGrid,
 )
-from orchestrator.learning.calibration.pour_design import DesignedPours
+from orchestrator.learning.calibration.pour_design import StratifiedDesign
 from orchestrator.learning.campaign_plan import CalibrationPlan, DeploymentPlan, MeasuredPour
 from orchestrator.learning.deployment.d1 import OneShotPlanning
 from orchestrator.learning.deployment.d2 import RealOnly
@@ -107,7 +107,7 @@ def _touches(action: Action) -> bool:
 
 @cache
 def measured(dimension: int) -> tuple[MeasuredPour, ...]:
-    design = DesignedPours((SCENE,), Space(ACTIONS[:dimension]), 6, 1, 0)
+    design = StratifiedDesign((SCENE,), Space(ACTIONS[:dimension]), 6, 1, 0)
     StrategyHarness(spill).run(design)
     return design.measured
 

@@ -26,7 +26,7 @@ from orchestrator.learning.calibration.pointwise_calibration import (
     StratifiedSampling,
     UniformGrid,
 )
-from orchestrator.learning.calibration.pour_design import DesignedPours
+from orchestrator.learning.calibration.pour_design import StratifiedDesign
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.deployment.d1 import OneShotPlanning
 from orchestrator.learning.deployment.d2 import RealOnly
@@ -64,7 +64,7 @@ ALL = [*CALIBRATIONS, *DEPLOYMENTS]
 
 @cache
 def measured() -> tuple[Any, ...]:
-    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 6, 1, 0)
+    design = StratifiedDesign((SCENE,), CALIBRATION_ACTIONS, 6, 1, 0)
     StrategyHarness(weighed).run(design)
     return design.measured
 
@@ -158,7 +158,7 @@ def test_designed_pours_and_scores_leave_out_what_is_no_number() -> None:
     def lost(request: Request) -> Outcome | None:
         return Poured(PourMeasurement(0.2, NAN, 0.0)) if isinstance(request, Pour) and request.number == 2 else None
 
-    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 4, 1, 0)
+    design = StratifiedDesign((SCENE,), CALIBRATION_ACTIONS, 4, 1, 0)
     StrategyHarness(weighed, answer=lost).run(design)
     assert len(design.measured) == 3
     assert "no numbers" in str(design.result().pours[1].given_up)
@@ -169,7 +169,7 @@ def test_designed_pours_and_scores_leave_out_what_is_no_number() -> None:
 def test_a_corrected_pour_leads_to_the_requests_of_one_that_was_told_rightly(name: str, wrong: Outcome) -> None:
     def played(*, corrected: bool) -> tuple[list[Request], dict[str, Any]]:
         designed = name == "designed pours"
-        strategy = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 4, 1, 0) if designed else make(name, 1)
+        strategy = StratifiedDesign((SCENE,), CALIBRATION_ACTIONS, 4, 1, 0) if designed else make(name, 1)
         tell = strategy.tell
 
         def told_wrongly(request: Request, outcome: Outcome) -> None:

@@ -24,7 +24,7 @@ from actors.optimizer.questions import (
     Suggestion,
     SurrogateMap,
 )
-from orchestrator.learning.calibration.pour_design import DesignPoured
+from orchestrator.learning.calibration.pour_design import DesignResult
 from orchestrator.learning.requests import Failed, Pour, Poured, Prediction, Simulate, Simulated, Suggest, Suggested
 from orchestrator.records.codec import (
     CodecError,
@@ -222,7 +222,7 @@ def test_empty_fields_of_an_earlier_version_are_ignored_and_others_are_refused()
     answer = encode_outcome(Suggested(Suggestion(((0.5,),))))
     answer["suggestion"] |= {"risk": None}
     assert decode_outcome(answer) == Suggested(Suggestion(((0.5,),)))
-    result = DesignPoured(pours=())
+    result = DesignResult(pours=())
     assert decode_result({**encode_result(result), "risk": None, "objectives": []}) == result
     answer["suggestion"]["risk"] = {"expected": [0.1]}
     with pytest.raises(CodecError, match="Suggestion has no field risk"):

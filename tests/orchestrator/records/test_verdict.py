@@ -14,7 +14,7 @@ from orchestrator.learning.deployment.deployment_result import Deployed, Recomme
 from orchestrator.learning.deployment.real_pours import PredictionCheck
 from orchestrator.learning.mixtures import Mix
 from orchestrator.learning.requests import Answered, Ask, Failed, Outcome, Pour, Poured, Slots
-from orchestrator.learning.single_action import OnePoured
+from orchestrator.learning.single_action import SingleResult
 from orchestrator.learning.stage_result import ENTERED, StageResult
 from orchestrator.records.events import (
     CampaignStateChanged,
@@ -130,7 +130,7 @@ def deployed(*, gave_up: str | None = None, found: bool = True) -> Deployed:
         (deployed(), "complete", ""),
         (deployed(gave_up="20 pours were refused"), "incomplete", "deployment:narrow: 20 pours were refused"),
         (deployed(found=False), "incomplete", "deployment:narrow: no action is recommended"),
-        (OnePoured(failed="pour_failed: it fell"), "incomplete", "deployment:narrow: it fell"),
+        (SingleResult(failed="pour_failed: it fell"), "incomplete", "deployment:narrow: it fell"),
     ],
 )
 def test_a_stage_has_to_have_the_result_that_it_was_run_for(result: StageResult, word: str, text: str) -> None:

@@ -19,14 +19,14 @@ from orchestrator.reports.figure_style import display_value, display_values, log
 from orchestrator.reports.loss_units import loss_unit
 from orchestrator.reports.run_figures import (
     DiscrepancyGroup,
-    PourSeries,
+    LossSeries,
     calibration_picture,
     deployment_picture,
     discrepancy_groups,
     draw_discrepancy,
     draw_figures,
     draw_losses,
-    pour_series,
+    loss_series,
 )
 from orchestrator.reports.stage_views import evaluation_of
 from orchestrator.reports.summarise import summarise
@@ -155,7 +155,7 @@ def test_expected_losses_below_zero_are_shown_as_zero_and_stored_as_they_are(
     assert recommended.predicted_loss == -0.013
     assert "0.00 ± 1.40 %" in shown(summary_table(summary))
     assert "-" not in loss_unit(Loss()).text(-0.013, 0.014)
-    (told,) = set(pour_series(plan, {"narrow cup": deployed}, loss_unit(Loss()))[0].predicted)
+    (told,) = set(loss_series(plan, {"narrow cup": deployed}, loss_unit(Loss()))[0].predicted)
     assert told == pytest.approx((0.0, 0.0, 0.78), abs=0.01)
     picture = deployment_picture(plan, deployed)
     assert picture is not None
@@ -168,13 +168,13 @@ def test_receivers_are_called_by_their_own_name_unless_two_share_it(results: dic
     assert plan.deployment is not None
     deployed = {"narrow cup": results["narrow cup"]}
     assert draw_figures(tmp_path, plan, deployed)["loss map narrow"].name == "loss-map-narrow.png"
-    assert pour_series(plan, deployed, loss_unit(Loss()))[0].receiver == "narrow (D3)"
+    assert loss_series(plan, deployed, loss_unit(Loss()))[0].receiver == "narrow (D3)"
     text = shown(summary_table(summarise(plan, deployed)))
     assert "narrow " in text
     assert "narrow cup" not in text
     low = replace(example_run.NARROW, name="low", fixed={"height": 0.02})
     twins = replace(plan, deployment=replace(plan.deployment, scenes=(example_run.NARROW, low)))
-    assert pour_series(twins, deployed, loss_unit(Loss()))[0].receiver == "narrow cup (D3)"
+    assert loss_series(twins, deployed, loss_unit(Loss()))[0].receiver == "narrow cup (D3)"
 
 
 def test_loss_map_numbers_its_pours_as_the_log_does(results: dict[str, Any]) -> None:
@@ -220,7 +220,7 @@ def test_nothing_to_draw_is_said_not_drawn(tmp_path: Path) -> None:
 
 
 def test_best_so_far_never_rises_and_skips_failed_pours() -> None:
-    series = PourSeries("cup", [None, 5.0, 7.0, None, 2.0], [None] * 5)
+    series = LossSeries("cup", [None, 5.0, 7.0, None, 2.0], [None] * 5)
     assert series.best_so_far() == [None, 5.0, 5.0, 5.0, 2.0]
 
 
@@ -230,26 +230,26 @@ def test_clueless_first_prediction_does_not_squeeze_the_measured_pours(
     tops: list[float] = []
     original = figures_module._pour_panel
 
-    def watching(axes: Any, series: PourSeries) -> float:
+    def watching(axes: Any, series: LossSeries) -> float:
         tops.append(original(axes, series))
         return tops[-1]
 
     monkeypatch.setattr(figures_module, "_pour_panel", watching)
-    series = PourSeries("cup", [10.0, 5.0, 2.0], [(50.0, 0.0, 850.0), (6.0, 4.0, 8.0), (2.0, 0.0, 4.0)])
+    series = LossSeries("cup", [10.0, 5.0, 2.0], [(50.0, 0.0, 850.0), (6.0, 4.0, 8.0), (2.0, 0.0, 4.0)])
     assert is_picture(style.save(draw_losses([series], cost="loss [%]", title=""), tmp_path / "spillage.png"))
     assert tops == [20.0]
 
 
 def test_receivers_and_predictors_that_are_missing_leave_room_not_errors(tmp_path: Path) -> None:
-    failed = PourSeries("cup", [None, None], [None, None])
+    failed = LossSeries("cup", [None, None], [None, None])
     assert is_picture(style.save(draw_losses([failed], cost="loss [%]", title="all failed"), tmp_path / "failed.png"))
     alone = DiscrepancyGroup("another receiver", 1, 0.05)
     assert is_picture(style.save(draw_discrepancy([alone], title="θ* alone"), tmp_path / "alone.png"))
 
 
 def test_a_single_pour_is_drawn_with_its_whole_prediction() -> None:
-    one = PourSeries("cup", [0.25], [(2.1, 0.0, 6.7)])
-    two = PourSeries("cup", [0.25, 0.2], [(2.1, 0.0, 6.7), (0.5, 0.1, 0.9)])
+    one = LossSeries("cup", [0.25], [(2.1, 0.0, 6.7)])
+    two = LossSeries("cup", [0.25, 0.2], [(2.1, 0.0, 6.7), (0.5, 0.1, 0.9)])
     shown = [draw_losses([series], cost="loss [%]", title="").axes[0].get_ylim()[1] for series in (one, two)]
     assert shown[0] > 6.7
     assert shown[1] < 1.0  # several measured values remain apart

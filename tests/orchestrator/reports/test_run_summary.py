@@ -12,7 +12,7 @@ import pytest
 from orchestrator.learning.calibration.campaign_memory import MemoryFound, MemoryGroup
 from orchestrator.learning.deployment.model_monitoring import Belief, Believed
 from orchestrator.learning.deployment.real_pours import PredictionCheck
-from orchestrator.learning.single_action import PredictedPour
+from orchestrator.learning.single_action import ActionPrediction
 from orchestrator.records.codec import decode_result
 from orchestrator.records.run_record import Occupancy
 from orchestrator.reports.console_view import print_summary, summary_table
@@ -161,7 +161,7 @@ def test_what_was_delivered_stands_in_table_and_file_in_grams_and_millilitres(re
     for pour in deployed.weighed:
         assert pour.delivered_g == pytest.approx(1e3 * liquid.mass - pour.spilled_g - pour.retained_g, abs=1e-9)
         assert pour.delivered_ml == pytest.approx(pour.delivered_g / liquid.density * 1e3)
-    foreseen = PredictedPour(
+    foreseen = ActionPrediction(
         scene="narrow cup",
         simulations=2,
         simulations_lost=0,

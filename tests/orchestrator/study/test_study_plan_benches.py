@@ -13,7 +13,7 @@ import pytest
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.learning.calibration.calibration_base import Calibrated
 from orchestrator.learning.calibration.calibration_scores import Scores
-from orchestrator.learning.calibration.pour_design import DesignPoured
+from orchestrator.learning.calibration.pour_design import DesignResult
 from orchestrator.records.codec import result_of
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS
 from orchestrator.study.study_file import load_study
@@ -91,7 +91,7 @@ def test_the_active_arm_learns_on_its_own_few_pours_and_is_scored_on_the_same_on
     played: tuple[StudyPlan, Any],
 ) -> None:
     _, results = played
-    own = result_of(results["pours.bench1.C4-active.01"].results, POURS, DesignPoured)
+    own = result_of(results["pours.bench1.C4-active.01"].results, POURS, DesignResult)
     assert len(own.measured) == 4
     assert own.simulated
     even, active = (

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
 
-from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta, TriedOnPours
+from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta, TriedOnAll
 from orchestrator.learning.calibration.calibration_scores import ScoredPair, Scores
 from orchestrator.learning.deployment.deployment_result import Deployed
-from orchestrator.learning.deployment.real_pours import PourRow, PredictionCheck
+from orchestrator.learning.deployment.real_pours import DeploymentRow, PredictionCheck
 from orchestrator.learning.stage_result import DisplayedMap
 from orchestrator.reports.figure_style import new_figure
 from orchestrator.study.calibration_figures import Drawn, draw_calibrations, series_style
@@ -27,7 +27,7 @@ from orchestrator.study.study_folder import CellResult, code_now, code_summary, 
 from orchestrator.study.study_page import tables, write_report
 from orchestrator.study.study_plan import StudyCell, StudyPlan, cells_of
 from orchestrator.study.study_statistics import Estimate, at_pour, effect, estimate, gather, running_least
-from orchestrator.study.study_strategies import FinalPoured
+from orchestrator.study.study_strategies import FinalResult
 from sim_engine.liquids import SimulationParameters
 from tests.support.example_results import strays
 from tests.support.study_files import read, written
@@ -78,9 +78,7 @@ def made_up(cell: StudyCell) -> CellResult:
             ),
         )
         trials = tuple(
-            TriedOnPours(
-                theta={"particles": 600 + 100 * i, "cohesion": 0.02 * i}, discrepancy=d, defined=4, largest=None
-            )
+            TriedOnAll(theta={"particles": 600 + 100 * i, "cohesion": 0.02 * i}, discrepancy=d, defined=4, largest=None)
             for i, d in enumerate((0.2, None, 0.1, 0.3))
         )
         results["calibration"] = Calibrated(
@@ -95,7 +93,7 @@ def made_up(cell: StudyCell) -> CellResult:
         loss = {"D1": 0.09, "D2": 0.2, "D3": 0.06}[cell.strategy.split("-")[0]] + 0.02 * (cell.repetition == 1)
         made = (cell.level, cell.strategy, cell.repetition) != ("large", "D2", 2)
         loss, spillage = (loss, loss / 2) if made else (1.0, 1.0)
-        results["final"] = FinalPoured(action_si=None, loss=loss, spillage=spillage, made=made, reason="")
+        results["final"] = FinalResult(action_si=None, loss=loss, spillage=spillage, made=made, reason="")
     return CellResult(
         results=results,
         simulations=10,
@@ -110,7 +108,7 @@ def made_up(cell: StudyCell) -> CellResult:
 def poured(strategy: str, rows: Sequence[tuple[Any, float]]) -> Deployed:
     """A deployment of which only its pours matter."""
     pours = [
-        PourRow(
+        DeploymentRow(
             number=number,
             status=status,
             reason="",

@@ -33,7 +33,7 @@ from orchestrator.daemon.rigs.submissions import Submission, SubmissionError, pa
 from orchestrator.daemon.state.access_tokens import Role
 from orchestrator.daemon.state.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.state.daemon_store import QueueItem
-from orchestrator.daemon.state.run_readout import Pours
+from orchestrator.daemon.state.run_readout import RunReadouts
 from orchestrator.reports.progress_state import CHECKPOINT_WORDS
 from orchestrator.runs.run_service import RunHandle, RunRequest
 from sim_engine.prediction_band import CalibrationResidual
@@ -98,7 +98,7 @@ async def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
         assert [pour["state"] for pour in found["pours_made"]] == ["weighed"] * 3
         settings, item = served.daemon.settings, served.supervisor.queue.item(key)
         plan = run_request(settings, item, settings.rig(item.rig)).campaign
-        afresh = Pours().of(settings.runs / str(item.run), lambda: plan, live=False)["pours_made"]
+        afresh = RunReadouts().of(settings.runs / str(item.run), lambda: plan, live=False)["pours_made"]
         assert found["pours_made"] == [pour.model_dump() for pour in afresh]
     assert len(read) == 1
 

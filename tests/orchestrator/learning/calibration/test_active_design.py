@@ -17,7 +17,7 @@ from actors.optimizer.questions import CalibrationQuery, Data, DesignQuestion, P
 from actors.optimizer.suggest import propose
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.learning.calibration.active_design import CLOSE, ActivePours, joint_contexts
+from orchestrator.learning.calibration.active_design import CLOSE, ActiveDesign, joint_contexts
 from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
 from orchestrator.learning.requests import Failed, Pour, Simulate, Slots
 from orchestrator.runs.stages import POURS, known_simulations, measured_pours, stages_of
@@ -68,13 +68,13 @@ def truth(action: Action, _: SimulationParameters, rng: np.random.Generator) -> 
 
 
 @pytest.fixture(scope="module")
-def played() -> tuple[ActivePours, StrategyHarness]:
-    strategy = ActivePours(*plans(), 3)
+def played() -> tuple[ActiveDesign, StrategyHarness]:
+    strategy = ActiveDesign(*plans(), 3)
     return strategy, StrategyHarness(spilled, truth).run(strategy)
 
 
 def test_it_simulates_what_is_to_be_deployed_and_then_pours_what_it_chose(
-    played: tuple[ActivePours, StrategyHarness],
+    played: tuple[ActiveDesign, StrategyHarness],
 ) -> None:
     strategy, play = played
     kinds = [type(request) for request in play.asked]
@@ -89,7 +89,7 @@ def test_it_simulates_what_is_to_be_deployed_and_then_pours_what_it_chose(
 
 
 @pytest.mark.slow
-def test_what_it_simulated_is_not_thrown_away(played: tuple[ActivePours, StrategyHarness]) -> None:
+def test_what_it_simulated_is_not_thrown_away(played: tuple[ActiveDesign, StrategyHarness]) -> None:
     strategy, _ = played
     plan, _ = plans()
     results = {POURS: strategy.result()}
@@ -105,8 +105,8 @@ def test_what_it_simulated_is_not_thrown_away(played: tuple[ActivePours, Strateg
     assert low <= TRUTH.receiver_x <= high
 
 
-def test_it_asks_for_the_same_when_it_is_replayed(played: tuple[ActivePours, StrategyHarness]) -> None:
-    assert replay(ActivePours(*plans(), 3), played[1]) == played[1].asked
+def test_it_asks_for_the_same_when_it_is_replayed(played: tuple[ActiveDesign, StrategyHarness]) -> None:
+    assert replay(ActiveDesign(*plans(), 3), played[1]) == played[1].asked
 
 
 def test_an_action_that_cannot_be_made_is_replaced_by_the_next_best() -> None:
@@ -118,7 +118,7 @@ def test_an_action_that_cannot_be_made_is_replaced_by_the_next_best() -> None:
             return Failed("invalid_action", "cups touch")
         return None
 
-    strategy = ActivePours(*plans(holdout=0, pour_count=3), 3)
+    strategy = ActiveDesign(*plans(holdout=0, pour_count=3), 3)
     StrategyHarness(spilled, truth, answer=answer).run(strategy)
     assert len(strategy.measured) == 3
     assert refused[0] != refused[1]
@@ -126,7 +126,7 @@ def test_an_action_that_cannot_be_made_is_replaced_by_the_next_best() -> None:
 
 
 def test_it_pours_even_where_no_simulation_comes_to_anything() -> None:
-    strategy = ActivePours(*plans(holdout=0, pour_count=3), 3)
+    strategy = ActiveDesign(*plans(holdout=0, pour_count=3), 3)
     StrategyHarness(lambda *_: float("nan"), truth).run(strategy)
     assert len(strategy.measured) == 3
     assert "too few simulations" in " ".join(decision.text for decision in strategy.decisions)
@@ -146,7 +146,7 @@ def test_no_pour_is_chosen_in_which_the_cups_may_touch_as_they_stand(searched: S
         return action.x_offset + truth_at < near
 
     nearer = SimulationParameters(receiver_x=truth_at)
-    strategy = ActivePours(*plans(holdout=0, pour_count=5, parameters=searched), 3)
+    strategy = ActiveDesign(*plans(holdout=0, pour_count=5, parameters=searched), 3)
     play = StrategyHarness(spilled, lambda a, _, rng: spilled(a, nearer, rng), answer=answer).run(strategy)
     lost = [touches(request.action) for request in play.asked if isinstance(request, Pour)]
     if searched is SEARCHED:
@@ -177,7 +177,7 @@ def test_a_campaign_asks_for_it_with_one_key(tmp_path: Path) -> None:
     assert plan.calibration is not None
     assert (plan.calibration.design, plan.calibration.design_simulations) == ("active", 24)
     strategy = stages_of(plan)[0].build({}, 1)
-    assert isinstance(strategy, ActivePours)
+    assert isinstance(strategy, ActiveDesign)
     assert len(strategy.ask(Slots(100, 1))) == 24
     path.write_text(path.read_text().replace("design: active, ", ""))
     with pytest.raises(ConfigError, match="belongs to 'design: active'"):
@@ -190,7 +190,7 @@ def test_if_the_cups_may_touch_in_all_pours_it_makes_those_in_which_they_touch_l
             return Failed("invalid_action", "cups touch")
         return None
 
-    strategy = ActivePours(*plans(holdout=0, pour_count=3), 3)
+    strategy = ActiveDesign(*plans(holdout=0, pour_count=3), 3)
     StrategyHarness(spilled, truth, answer=answer).run(strategy)
     assert len(strategy.measured) == 3
     assert all(pour.action.x_offset > 0.115 for pour in strategy.measured)

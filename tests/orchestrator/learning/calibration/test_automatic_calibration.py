@@ -23,7 +23,7 @@ from orchestrator.learning.calibration.calibration_scores import (
     Scores,
 )
 from orchestrator.learning.calibration.posterior_summary import posterior_change
-from orchestrator.learning.calibration.pour_residuals import SimulatedPour, pour_residuals
+from orchestrator.learning.calibration.pour_residuals import ResidualPair, pour_residuals
 from orchestrator.learning.campaign_plan import MeasuredPour
 from orchestrator.learning.requests import Failed, Outcome, Request, Simulate
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, deployed_theta, with_posterior
@@ -201,8 +201,8 @@ def test_swapped_weights_are_named_with_their_intervals_and_theta_without_them()
 
 
 def test_few_pours_are_not_judged_and_a_pour_does_not_hide_itself() -> None:
-    def pair(r: float, c: float, split: str = "train") -> SimulatedPour:
-        return SimulatedPour(MeasuredPour(SCENE.action(CALIBRATION_ACTIONS.decode([0.5, 0.5])), r, 0.9, split), "s", c)
+    def pair(r: float, c: float, split: str = "train") -> ResidualPair:
+        return ResidualPair(MeasuredPour(SCENE.action(CALIBRATION_ACTIONS.decode([0.5, 0.5])), r, 0.9, split), "s", c)
 
     few = pour_residuals([pair(0.1, 0.1), pair(0.9, 0.1)], 2000)
     assert [pour.fits for pour in few] == [None, None]

@@ -21,10 +21,10 @@ from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.catalogue.catalogue import Catalogue
 from orchestrator.catalogue.known_posteriors import import_posterior, posterior_of, posterior_text
 from orchestrator.cli.app import app
-from orchestrator.learning.calibration.active_design import ActivePours
+from orchestrator.learning.calibration.active_design import ActiveDesign
 from orchestrator.learning.calibration.calibration_scores import ScoredPair, Scores
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory, RememberedParameter, predicted
-from orchestrator.learning.calibration.pour_design import DesignedPours, DesignPoured, PouredPoint
+from orchestrator.learning.calibration.pour_design import DesignResult, StratifiedDesign, WeighedPoint
 from orchestrator.learning.campaign_plan import MeasuredPour
 from orchestrator.records.events import StageClosed
 from orchestrator.records.run_record import Header, RunState
@@ -161,7 +161,7 @@ def test_pours_that_are_chosen_with_a_memory_can_contradict_it(design: str, cont
     wrong = CampaignMemory((RememberedParameter("receiver_x", -0.012, 0.001, ("earlier-1",)),))
     searched: dict[str, Any] = {"actions": wide, "parameters": SEARCHED, "fixed_parameters": {}, "memory": wrong}
     plan = calibration_plan(**searched, scene=SLOW, simulations="auto", pour_count=3, holdout=0, design_simulations=40)
-    made = ActivePours(plan, None, 1) if design == "active" else DesignedPours((SLOW,), wide, 3, 0, 1)
+    made = ActiveDesign(plan, None, 1) if design == "active" else StratifiedDesign((SLOW,), wide, 3, 0, 1)
     truth = SimulationParameters(receiver_x=0.008)
     StrategyHarness(spilled, lambda action, _, rng: spilled(action, truth, rng)).run(made)
     strategy = plan.settings.build(plan, made.measured, 1)
@@ -402,8 +402,9 @@ def test_a_run_that_was_evaluated_tells_its_pours_as_if_each_had_been_left_out_o
     header["calibration"]["parameters"]["axes"] = [axis for axis in axes if axis["name"] == "receiver_x"]
     scene = header["calibration"]["scene"]["name"]
     splits = ["test", "train", "train"]
+    made = {"action": {}, "action_si": {"angular_velocity": 1.0, "x_offset": 0.1}}
     poured = [
-        PouredPoint(number=i, split=split, scene=scene, action={}, action_si={"angular_velocity": 1.0, "x_offset": 0.1},
+        WeighedPoint(number=i, split=split, scene=scene, **made,
                     spillage=0.1, poured=0.9, invalid_tries=0)
         for i, split in enumerate(splits[::-1], 1)
     ]  # fmt: skip
@@ -414,7 +415,7 @@ def test_a_run_that_was_evaluated_tells_its_pours_as_if_each_had_been_left_out_o
     ]
     scores = Scores(simulations=6, undefined={}, discrepancy={}, random_median={}, thetas={}, pairs=tuple(pairs))
     record = RunState(Header("second", header))
-    record.closed["pours"] = StageClosed(stage="pours", result=DesignPoured(pours=tuple(poured)))
+    record.closed["pours"] = StageClosed(stage="pours", result=DesignResult(pours=tuple(poured)))
     record.closed["calibration"] = StageClosed(stage="calibration", result=calibrated(None).result())
     assert posterior_of(tmp_path, record).weighed == []  # without their simulations they say nothing
     record.closed["evaluation"] = StageClosed(stage="evaluation", result=scores)

@@ -20,7 +20,7 @@ from orchestrator.learning.calibration.calibration_scores import (
     regression_discrepancy,
 )
 from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.learning.calibration.pour_design import DesignedPours, choose_holdout, stratified
+from orchestrator.learning.calibration.pour_design import StratifiedDesign, choose_holdout, stratified
 from orchestrator.learning.campaign_plan import MeasuredPour
 from orchestrator.learning.requests import Failed, Simulate, Simulated, Suggest, Suggested
 from orchestrator.learning.run_errors import LearningError
@@ -47,7 +47,7 @@ class Quiet:
 
 
 def measured(seed=0, count=32, holdout=4):
-    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, count, holdout, seed)
+    design = StratifiedDesign((SCENE,), CALIBRATION_ACTIONS, count, holdout, seed)
     StrategyHarness(weighed).run(design)
     return design.measured
 
@@ -93,7 +93,7 @@ def test_an_impossible_action_is_replaced_by_another_of_its_stratum():
             raise ValueError("cups touch")
         return 0.1
 
-    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 32, 4, 1)
+    design = StratifiedDesign((SCENE,), CALIBRATION_ACTIONS, 32, 4, 1)
     played = StrategyHarness(sometimes_touching).run(design)
     assert refused
     assert len(played.pours) == 32 + len(refused)
@@ -106,14 +106,14 @@ def test_a_stratum_without_a_possible_action_is_given_up_with_its_reason():
     def never(action, theta, rng):
         raise ValueError("cups touch: at tilt 37° …")
 
-    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 2, 0, 1)
+    design = StratifiedDesign((SCENE,), CALIBRATION_ACTIONS, 2, 0, 1)
     StrategyHarness(never).run(design)
     assert design.measured == ()
     assert "cups touch" in str(design.result().pours[0].given_up)
 
 
 def test_weighed_pours_survive_the_journal():
-    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 6, 1, 1)
+    design = StratifiedDesign((SCENE,), CALIBRATION_ACTIONS, 6, 1, 1)
     StrategyHarness(weighed).run(design)
     read_back = measured_pours(calibration_plan(), {POURS: design.result()})
     assert tuple(scored.pour for scored in read_back) == design.measured

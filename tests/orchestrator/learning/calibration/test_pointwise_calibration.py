@@ -9,7 +9,7 @@ from orchestrator.learning.calibration.pointwise_calibration import (
     StratifiedSampling,
     UniformGrid,
 )
-from orchestrator.learning.calibration.pour_design import DesignedPours
+from orchestrator.learning.calibration.pour_design import StratifiedDesign
 from orchestrator.learning.requests import Failed, Simulate, Simulated, Suggest
 from orchestrator.learning.run_errors import LearningError
 from orchestrator.learning.strategy import Progress
@@ -22,7 +22,7 @@ BUDGETS = {"C1": {"grid": {"particles": 4, "cohesion": 4}}, "C2": {"samples": 18
 
 
 def measured(seed=0, count=12, holdout=2):
-    design = DesignedPours((SCENE,), CALIBRATION_ACTIONS, count, holdout, seed)
+    design = StratifiedDesign((SCENE,), CALIBRATION_ACTIONS, count, holdout, seed)
     StrategyHarness(weighed).run(design)
     return design.measured
 

@@ -17,7 +17,7 @@ from orchestrator.learning.calibration.calibration_scores import CalibrationGain
 from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
 from orchestrator.learning.campaign_plan import DeploymentPlan, MeasuredPour
 from orchestrator.learning.deployment.costing import Costing
-from orchestrator.learning.single_action import PredictedPour, RepeatedSimulation
+from orchestrator.learning.single_action import ActionPrediction, RepeatedSimulation
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, posterior_draws, with_posterior
 from orchestrator.runs.strategy_harness import CALIBRATION_ACTIONS, SCENE, StrategyHarness
 from sim_engine.action import DEG, Action
@@ -69,7 +69,7 @@ def calibrated(perturbed: int) -> Calibrated:
     return strategy.result()
 
 
-def predicted(found: Calibrated) -> PredictedPour:
+def predicted(found: Calibrated) -> ActionPrediction:
     """The prediction of a pour into the bowl with draws of the posterior."""
     assert found.found is not None
     action = SCENE.action({"angular_velocity": 90 * DEG, "max_angle": 100 * DEG})

@@ -15,7 +15,7 @@ from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.learning.calibration.action_prior import Contexts
 from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.learning.calibration.pour_design import DesignedPours
+from orchestrator.learning.calibration.pour_design import StratifiedDesign
 from orchestrator.learning.requests import Simulate
 from orchestrator.runs.stages import POURS, measured_pours, scenes_of
 from orchestrator.runs.strategy_harness import CALIBRATION_ACTIONS, SCENE, StrategyHarness
@@ -55,11 +55,11 @@ def played(strategy: Any) -> Any:
 
 
 @pytest.fixture(scope="module")
-def design() -> DesignedPours:
-    return played(DesignedPours((SCENE, WIDE), CALIBRATION_ACTIONS, 12, 2, 0))  # type: ignore[no-any-return]
+def design() -> StratifiedDesign:
+    return played(StratifiedDesign((SCENE, WIDE), CALIBRATION_ACTIONS, 12, 2, 0))  # type: ignore[no-any-return]
 
 
-def test_pours_go_into_all_receivers_by_turns(design: DesignedPours) -> None:
+def test_pours_go_into_all_receivers_by_turns(design: StratifiedDesign) -> None:
     by_split = [(pour.split, pour.scene) for pour in design.measured]
     assert by_split.count(("train", SCENE.name)) == by_split.count(("train", WIDE.name)) == 5
     assert by_split.count(("test", SCENE.name)) == by_split.count(("test", WIDE.name)) == 1
@@ -67,7 +67,7 @@ def test_pours_go_into_all_receivers_by_turns(design: DesignedPours) -> None:
 
 
 @pytest.mark.slow
-def test_what_each_receiver_tells_is_put_together(design: DesignedPours) -> None:
+def test_what_each_receiver_tells_is_put_together(design: StratifiedDesign) -> None:
     plan = calibration_plan(parameters=SEARCHED, fixed_parameters={}, simulations=36, further=(WIDE,))
     measured = [scored.pour for scored in measured_pours(plan, {POURS: design.result()})]
     assert {pour.scene for pour in measured} == {SCENE.name, WIDE.name}

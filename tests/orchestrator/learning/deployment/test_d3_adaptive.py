@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.optimizer.questions import CalibrationPours, DiscrepancyFound, PourQuery
+from actors.optimizer.questions import DiscrepancyFound, PourQuery, SceneEvidence
 from orchestrator.learning.campaign_plan import CalibrationEvidence
 from orchestrator.learning.deployment.d3 import Hybrid
 from orchestrator.learning.deployment.deployment_result import Deployed
@@ -21,7 +21,7 @@ from orchestrator.learning.deployment.model_monitoring import (
     displacement,
     offset_priors,
 )
-from orchestrator.learning.deployment.real_pours import PourTrial
+from orchestrator.learning.deployment.real_pours import DeploymentTrial
 from orchestrator.learning.requests import Suggest
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.runs.stages import DEPLOYMENT, with_offsets
@@ -168,7 +168,7 @@ def test_a_drift_is_said_once_and_how_fast() -> None:
 def test_on_a_drifting_bench_a_change_is_said_once_and_none_after_the_drift() -> None:
     monitor = SimulatorMonitor(Rules(None, "go on", None, None), ACTIONS, 1.0, [])
     still = DiscrepancyFound(0.01, (0.0, 0.0), (0.1, 0.1), 1.0)
-    pours = [PourTrial(number, (0.5, 0.5), {}, None, 0.01, cost=0.1) for number in range(1, 41)]
+    pours = [DeploymentTrial(number, (0.5, 0.5), {}, None, 0.01, cost=0.1) for number in range(1, 41)]
     # Since pour 21, dated again after an answer without a change; a drift; and a change that the drift explains.
     answers = {22: (2, None), 23: (None, None), 25: (5, None), 27: (3, None), 30: (None, (0.0, 0.003)), 38: (2, None)}
     for made, (since, drifts) in answers.items():
@@ -181,7 +181,7 @@ def test_on_a_drifting_bench_a_change_is_said_once_and_none_after_the_drift() ->
 def test_a_second_change_long_after_the_first_is_said() -> None:
     monitor = SimulatorMonitor(Rules(None, "go on", None, None), ACTIONS, 1.0, [])
     still = DiscrepancyFound(0.01, (0.0, 0.0), (0.1, 0.1), 1.0)
-    pours = [PourTrial(number, (0.5, 0.5), {}, None, 0.01, cost=0.1) for number in range(1, 41)]
+    pours = [DeploymentTrial(number, (0.5, 0.5), {}, None, 0.01, cost=0.1) for number in range(1, 41)]
     for made, since in {6: 2, 20: 2}.items():
         monitor.record(replace(still, since_change=since), pours[:made])
     assert [decision.text[:13] for decision in monitor.decisions if decision.text.startswith("since")] == [
@@ -268,7 +268,7 @@ def evidence(spill: Any, seed: int = 3) -> CalibrationEvidence:
     rng = np.random.default_rng(seed)
     points = [tuple(map(float, row)) for row in rng.random((12, 2))]
     simulated = [narrow_cup(SCENE.action(ACTIONS.decode(point)), THETA, rng) for point in points]
-    pours = CalibrationPours(tuple(points), tuple(spill(c) for c in simulated), tuple(simulated), 0.4)
+    pours = SceneEvidence(tuple(points), tuple(spill(c) for c in simulated), tuple(simulated), 0.4)
     return CalibrationEvidence((pours,), ("12 calibration pours", "not used: 2 pours of another liquid"))
 
 

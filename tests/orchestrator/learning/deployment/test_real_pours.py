@@ -21,7 +21,7 @@ from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.learning.deployment.d2 import RealOnly
 from orchestrator.learning.deployment.d3 import Hybrid
-from orchestrator.learning.deployment.real_pours import PourTrial, scaled_interval
+from orchestrator.learning.deployment.real_pours import DeploymentTrial, scaled_interval
 from orchestrator.learning.requests import Failed, Outcome, Pour, Prediction, Request, Simulate, Slots
 from orchestrator.learning.single_action import RepeatedSimulation
 from orchestrator.learning.strategy import Progress, Strategy
@@ -279,10 +279,10 @@ def test_nine_pours_in_ten_lie_in_the_band_whatever_the_model_told(
     assert replace(predicted, band=(0.1, 0.2)).of_a_pour() == (0.1, 0.2)
 
 
-def poured(*losses: float | None) -> list[PourTrial]:
+def poured(*losses: float | None) -> list[DeploymentTrial]:
     """Pours that were each predicted as 0.2 ± 0.05."""
     predicted = Prediction(0.2, 0.03, 0.04)
-    return [PourTrial(i, (0.5,), {}, predicted, 0.04, cost=loss) for i, loss in enumerate(losses, start=1)]
+    return [DeploymentTrial(i, (0.5,), {}, predicted, 0.04, cost=loss) for i, loss in enumerate(losses, start=1)]
 
 
 def test_intervals_become_as_wide_as_the_earlier_pours_deviated() -> None:
