@@ -148,7 +148,9 @@ class FrankaKind(ChainArmKind[FrankaSettings]):
         """See `ArmKind.check_laboratory`."""
         arm = problems.within("arm")
         _check_address(arm, self.spec.address, mode)
-        if mode == "virtual" and arm.valid("model") and self.spec.model != "fr3":
+        if not arm.valid("model"):
+            return
+        if mode == "virtual" and self.spec.model != "fr3":
             arm.add("the emulated Franka is an FR3; write 'fr3', or 'mode: hardware'", "model")
         super().check_laboratory(problems, mode=mode, cell=cell)
 

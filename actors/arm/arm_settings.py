@@ -105,7 +105,7 @@ class ArmSettings(Settings):
     plugins: ClassVar[str] = "decant.arms"
 
     digital_outputs: ClassVar[bool] = False
-    """Whether `address` is a controller whose digital outputs can switch a gripper, as a UR's can."""
+    """Whether `address` is a controller with URCaps, and digital outputs that can switch a gripper: a UR's."""
 
     kind: str = ""
     """Kind of the arm."""

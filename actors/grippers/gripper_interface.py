@@ -270,10 +270,24 @@ CONTROLLER_PORTS = {22, 80, 502, 29999, *range(30001, 30005), *range(30011, 3001
 """Ports of a UR controller that serve something else."""
 
 
-def check_port(problems: Problems, port: int, usual: int) -> None:
-    """Add a problem if a port of the controller serves something else than a gripper."""
+def check_urcap(
+    problems: Problems, settings: GripperSettings, port: int, usual: int, *, mode: str, arm: ArmSettings | None
+) -> None:
+    """Add a problem if there is no URCap of the gripper where it is asked for.
+
+    Args:
+        problems: of the settings.
+        settings: of the gripper.
+        port: at its address.
+        usual: port of the URCap.
+        mode: 'virtual' or 'hardware'.
+        arm: of the laboratory.
+    """
     if problems.valid("port") and port in CONTROLLER_PORTS:
         problems.add(f"{port} is a port of the controller itself; the gripper's URCap listens on {usual}", "port")
+    if mode == "hardware" and not settings.address and arm is not None and not arm.digital_outputs:
+        text = "only a UR's controller has the gripper's URCap; add 'address', of the gripper's own server"
+        problems.add(text, of="address")
 
 
 def opened(state: GripperState, width: float, accuracy: float, where: str) -> GripperState:

@@ -23,7 +23,7 @@ from actors.grippers.gripper_interface import (
     GripperSettings,
     GripperState,
     TcpPort,
-    check_port,
+    check_urcap,
     opened,
     settled,
 )
@@ -103,7 +103,7 @@ class OnRobotSettings(GripperSettings):
     def check_laboratory(self, problems: Problems, *, mode: str, arm: ArmSettings | None) -> None:
         """See `GripperSettings.check_laboratory`."""
         super().check_laboratory(problems, mode=mode, arm=arm)
-        check_port(problems, self.port, PORT)
+        check_urcap(problems, self, self.port, PORT, mode=mode, arm=arm)
 
 
 class _Transport(xmlrpc.client.Transport):

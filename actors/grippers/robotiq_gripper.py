@@ -30,7 +30,7 @@ from actors.grippers.gripper_interface import (
     GripperState,
     TcpPort,
     Width,
-    check_port,
+    check_urcap,
     opened,
     settled,
 )
@@ -173,7 +173,7 @@ class RobotiqSettings(GripperSettings):
     def check_laboratory(self, problems: Problems, *, mode: str, arm: ArmSettings | None) -> None:
         """See `GripperSettings.check_laboratory`."""
         super().check_laboratory(problems, mode=mode, arm=arm)
-        check_port(problems, self.port, PORT)
+        check_urcap(problems, self, self.port, PORT, mode=mode, arm=arm)
 
 
 _REPLY = re.compile(rb"([A-Z]{3}) +(\?|-?\d{1,4})\r?\n?")

@@ -52,7 +52,8 @@ class FrankaEmulator:
             [
                 *python_module("actors.emulators.franka.franka_process", "--address", address, "--clock", str(clock)),
                 *("--time-scale", repr(spec.time_scale), "--joints=" + ",".join(repr(q) for q in spec.home_joints)),
-            ]
+            ],
+            prompt=True,
         )
         try:
             json.loads(self._process.read_line(START_TIME))

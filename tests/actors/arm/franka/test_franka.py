@@ -219,6 +219,16 @@ def test_nobody_at_the_address(emulator: FrankaEmulator) -> None:
     arm.close()
 
 
+def test_another_client_in_control(emulator: FrankaEmulator, arm: VelocityArm, monkeypatch: pytest.MonkeyPatch) -> None:
+    arm.connect()
+    monkeypatch.setattr("actors.arm.franka.franka_arm.OPEN_TIME", 0.5)
+    second = VelocityArm(emulator.arm, FrankaRobot)
+    with pytest.raises(ArmLostError, match="is another client in control"):
+        second.connect()
+    second.close()
+    assert arm.facts().problem == ""
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
 
 import actors.arm.franka
-from actors.arm.franka.franka_arm import MODELS
-from orchestrator.campaigns.file_loading import load_campaign
+from actors.arm.franka.franka_arm import MODELS, FrankaSettings
+from actors.device_kinds import FrankaKind
+from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
 from sim_engine.errors import DecantError
+from sim_engine.liquids import Liquid
+from sim_engine.scene import Scene
+from tests.support.planning_cell import ACTION, vessel
 
 
 def test_without_the_extra_the_shipped_laboratory_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -18,6 +24,74 @@ def test_without_the_extra_the_shipped_laboratory_says_what_to_install(monkeypat
     with pytest.raises(DecantError, match=r"franka\.yaml:.* pip install 'decant-pouring\[franka-sim\]'") as error:
         load_campaign(Path("configs/campaigns/quickstart.yaml"), Path("configs/laboratories/franka.yaml"))
     assert str(error.value).count("pip install") == 1
+
+
+def changed(folder: Path, *changes: tuple[str, str]) -> Path:
+    """The shipped laboratory with other text."""
+    text = Path("configs/laboratories/franka.yaml").read_text(encoding="utf-8")
+    for pattern, new in changes:
+        text, count = re.subn(pattern, new, text)
+        assert count == 1, pattern
+    path = folder / "laboratory.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+HARDWARE = [
+    ("mode: virtual", "mode: hardware"),
+    ("kind: franka", "kind: franka\n  address: 172.16.0.2"),
+    ("virtual: {.*}", "port: /dev/ttyUSB0"),
+    (r"operator:(?s:.)*", ""),
+]
+GRIPPER = "balance:", "gripper: {kind: onrobot, model: RG6}\nbalance:"
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ([("model: fr3", "model: fr4")], r"arm\.model: 'fr4' is not supported; supported are fr3, panda"),
+        ([("model: fr3", "model: panda")], r"arm\.model: the emulated Franka is an FR3; write 'fr3', or 'mode: hard"),
+        ([*HARDWARE, ("model: fr3", "model: panda")], r"joint 6 \(joint6\) at 243.1 deg is outside .* -1 … 215 deg"),
+        ([(r", 42\.90 deg\]", "]")], r"arm\.home: has 6 joints; this arm has 7"),
+        ([HARDWARE[0], *HARDWARE[2:]], r"arm: an arm of hardware needs its controller's 'address'"),
+        (
+            [("rx: -69.282 deg, ry: 69.282 deg, rz: -69.282 deg", "ry: 90 deg")],
+            r"arm\.grip: the hand is where the liquid leaves",
+        ),
+        ([("z: 100 mm}  #", "z: 900 mm}  #")], r"cell\.receiver: an upright pourer beside it, .* out of reach"),
+        ([*HARDWARE, GRIPPER], r"gripper: only a UR's controller has the gripper's URCap; add 'address'"),
+        ([("balance:", "gripper: {kind: digital, close: standard 3, opening: 85 mm}\nbalance:")], "digital"),
+    ],
+)
+def test_a_laboratory_that_no_franka_fits_has_one_error(
+    changes: list[tuple[str, str]], text: str, tmp_path: Path
+) -> None:
+    pytest.importorskip("pinocchio")
+    pytest.importorskip("franky_sim")
+    with pytest.raises(DecantError, match=text) as error:
+        load_laboratory(changed(tmp_path, *changes))
+    assert str(error.value).count("laboratory.yaml:") == 1
+
+
+def test_the_arm_makes_the_fastest_pour_that_is_searched(tmp_path: Path) -> None:
+    """The search of a campaign ends at the arm's own limit."""
+    pytest.importorskip("pinocchio")
+    pytest.importorskip("franky_sim")
+    settings = load_laboratory(changed(tmp_path)).arm
+    assert isinstance(settings, FrankaSettings)
+    scene = Scene("s", vessel("beaker").spec, vessel("tumbler").spec, Liquid(name="water", mass=0.2))
+    fastest = settings.tilt_speed_limit
+    path = FrankaKind(settings).plan(scene, dataclasses.replace(ACTION, height=0.11, angular_velocity=fastest))
+    assert path.report.tilt_speed == pytest.approx(fastest, rel=1e-3)
+
+
+def test_a_gripper_with_a_server_of_its_own_fits_beside_a_franka(tmp_path: Path) -> None:
+    pytest.importorskip("pinocchio")
+    pytest.importorskip("franky_sim")
+    own = GRIPPER[0], GRIPPER[1].replace("RG6}", "RG6, address: 172.16.0.9}")
+    laboratory = load_laboratory(changed(tmp_path, *HARDWARE, own))
+    assert laboratory.gripper is not None
+    assert laboratory.gripper.beside(laboratory.arm).address == "172.16.0.9"
 
 
 @pytest.mark.parametrize("model", MODELS)
