@@ -228,38 +228,45 @@ def explain_capture(capture: Capture) -> tuple[list[str], str | None]:
     if not fits:
         line = most_telling(lines, list(dialects().values())) or lines[0]
         problem = f"no dialect reads a weight in these lines, such as {shown_bytes(line)}. "
-        framed = next(filter(None, map(_framed, lines)), None)
-        labels = {match.lastindex for match in map(_LABEL.match, lines) if match}
-        if framed is not None:
-            problem += framed
-        elif status := _status_alone(lines):
-            problem += status
-        elif not is_text(b"".join(lines)):
-            problem += (
-                "They are not text: speed or parity differ; set 'baud' and 'format' as in the balance's menu, over "
-                "TCP in the serial server"
-            )
-            if (form := _parity(lines)) is not None:
-                problem += f". As '{form}' they are weights: set 'format: {form}', also in a terminal program"
-        elif all(map(_UNMARKED.fullmatch, lines)):
-            problem += (
-                "They look like lines of a G&G balance, which do not say whether the weight is stable: use a balance "
-                "with one of the protocols in the page on balances"
-            )
-        elif len(labels) > 1:
-            problem += f"As their letters show, {IN_TURN}, with its unit"
-        else:
-            stated = any(re.search(rb"[0-9] *(?:mg|g|kg)\b", line) for line in lines)
-            how = "as one of the protocols in the page on balances" if stated else "in g with its unit"
-            problem += f"Set the balance to print the weight {how}, or choose another protocol in its menu"
-            if not capture.about:
-                problem += ". A program that cuts blanks at the ends of lines off damages them"
-        return text, problem
+        return text, problem + _advice(capture)
+    return text + _described(fits, capture), None
+
+
+def _advice(capture: Capture) -> str:
+    """What to do about lines in which no dialect reads a weight."""
+    lines = capture.lines
+    if (framed := next(filter(None, map(_framed, lines)), None)) is not None:
+        return framed
+    if status := _status_alone(lines):
+        return status
+    if not is_text(b"".join(lines)):
+        remedy = (
+            "They are not text: speed or parity differ; set 'baud' and 'format' as in the balance's menu, over TCP in "
+            "the serial server"
+        )
+        if (form := _parity(lines)) is not None:
+            remedy += f". As '{form}' they are weights: set 'format: {form}', also in a terminal program"
+        return remedy
+    if all(map(_UNMARKED.fullmatch, lines)):
+        return (
+            "They look like lines of a G&G balance, which do not say whether the weight is stable: use a balance with "
+            "one of the protocols in the page on balances"
+        )
+    if len({match.lastindex for match in map(_LABEL.match, lines) if match}) > 1:
+        return f"As their letters show, {IN_TURN}, with its unit"
+    stated = any(re.search(rb"[0-9] *(?:mg|g|kg)\b", line) for line in lines)
+    how = "as one of the protocols in the page on balances" if stated else "in g with its unit"
+    damaged = "" if capture.about else ". A program that cuts blanks at the ends of lines off damages them"
+    return f"Set the balance to print the weight {how}, or choose another protocol in its menu{damaged}"
+
+
+def _described(fits: Sequence[DialectFit], capture: Capture) -> list[str]:
+    """The dialects that fit equally well, and what the first one reads and leaves in the lines of a capture."""
     fit = fits[0]
     reads = ", ".join(fit.reads[:_MOST]) + (f", … ({len(fit.reads)})" if len(fit.reads) > _MOST else "")
     alike = "; 'dialect: auto' tells them apart by their replies" if len(fits) > 1 else ""
     names = " or ".join(fit.dialect.name for fit in fits)
-    text.append(f"best fit: {names} ({fit.weights} weights in {len(lines)} lines){alike}")
+    text = [f"best fit: {names} ({fit.weights} weights in {len(capture.lines)} lines){alike}"]
     text.append(f"  stable weights: {reads or 'none'}")
     text += [f"  {count} × {other}" for other, count in fit.others.most_common(_MOST)]
     if (hidden := len(fit.others) - _MOST) > 0:
@@ -271,7 +278,7 @@ def explain_capture(capture: Capture) -> tuple[list[str], str | None]:
         text.append(f"  {IN_TURN}")
     if len(fit.marks) > 1:
         text.append("  weight: net   # or gross; it sends both")
-    return text, None
+    return text
 
 
 def _decoded(dialect: Dialect, line: bytes) -> object:

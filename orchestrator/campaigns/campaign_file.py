@@ -116,7 +116,7 @@ class PoursSettings(TableSource):
         if self.source is None:
             text = "belongs to pours that are read 'from' a CSV file"
             self.check_exclusive(problems, ("lip_radius", "transfer", "columns"), text)
-        if self.source is not None or self.from_run is not None:
+        if not self.are_made:
             origin = "a file" if self.source is not None else "a run"
             text = f"belongs to pours that are still to be made; these are read 'from' {origin}"
             further = ["design"] if self.design == "active" else []
@@ -136,6 +136,11 @@ class PoursSettings(TableSource):
                 f"calibration needs {LEAST_TRAINING_POURS}"
             )
             problems.add(text, "count" if self.holdout is None else "holdout")
+
+    @property
+    def are_made(self) -> bool:
+        """Whether the pours are made on the bench; otherwise they are read."""
+        return self.source is None and self.from_run is None
 
     @property
     def held_out(self) -> int:

@@ -28,6 +28,7 @@ from orchestrator.campaigns.campaign_file import (
 from orchestrator.campaigns.campaign_prior import PosteriorSource, PriorNeeds, ResolvedPrior, resolve_prior
 from orchestrator.campaigns.dose_resolution import cell_vessels, require_bench, resolve_dispense, resolve_mixtures
 from orchestrator.campaigns.file_references import References
+from orchestrator.campaigns.pour_table import RecordTable
 from orchestrator.campaigns.run_snapshot import as_file
 from orchestrator.campaigns.scene_builder import SceneBuilder
 from orchestrator.campaigns.search_ranges import ParametersBase
@@ -43,6 +44,7 @@ from orchestrator.learning.campaign_plan import (
     DeploymentPlan,
     DispensePlan,
     NormalPrior,
+    RecordSet,
 )
 from orchestrator.learning.deployment.objectives import STOPS
 from sim_engine.liquids import SimulationParameters
@@ -173,53 +175,29 @@ def resolve_calibration(
     """
     report, at = builder.report, place.at("pours")
     ground = StageGround.of(section, builder, place, inherit=False)
-    actions, receivers = ground.actions, ground.receivers
-    prior = _prior(section, builder, place, actions, ground.constraints)
+    prior = _prior(section, builder, place, ground.actions, ground.constraints)
     pours: PoursSettings = section.pours or PoursSettings()  # a draft may lack it, which is reported
     table = read_table(pours, pours.source, at.at("from"), builder)
-    scene = ground.scene(
-        "calibration",
-        receivers[0] if receivers else None,
-        recorded=pours.source is not None or pours.from_run is not None,
-        constants={} if table is None else table.constants(),
-        unread=table is None and (pours.source is not None or report.is_broken(at.at("from"))),
-    )
-    further = [
-        ground.scene(f"calibration-{other.name}", other)
-        for other in receivers[1:]
-        if other is not None and scene is not None
-    ]
-    if further and pours.source is not None:
-        text = "stands beside pours that are read 'from' a file, which were made into one; keep 'receiver'"
-        report.add(place.at("receivers"), text, key=True)
-    others = tuple(other for other in further if other is not None)
-    tested = _tested_scenes(pours, at, ground, scene, others)
-    records = transfer = None
-    if pours.source is not None:
-        records, transfer = resolve_records(pours, at, builder, table, actions, scene, ground.pourer, ground.motions)
-    elif pours.from_run is not None:
-        if scene is not None and actions is not None:
-            records = records_of_run(
-                pours.from_run, at.at("from_run"), (scene, *others, *tested), actions, laboratory, report
-            )
-    elif pours.count and laboratory is not None and not laboratory.pours:
-        text = f"laboratory '{laboratory.name}' has no bench to pour on; name a CSV file with 'from'"
-        report.add(at.at("count"), text)
-    poured = pours.source is None and pours.from_run is None
-    count, holdout = (pours.count or 0, pours.held_out) if poured else (0, 0)
+    scenes = _calibration_scenes(pours, at, ground, table)
+    records, transfer = _existing_pours(pours, at, ground, scenes, table, laboratory)
+    if pours.are_made:
+        _check_that_bench_pours(pours, laboratory, at.at("count"), report)
+    count, holdout = (pours.count or 0, pours.held_out) if pours.are_made else (0, 0)
+    train = count - holdout if records is None else records.training_pours
+    if records is not None and not report.is_broken(place.at("strategy")):
+        _check_training_pours(train, at.at("from" if pours.source is not None else "from_run"), report)
     settings = None
     if not report.is_broken(place.at("strategy")):
-        train = count - holdout if records is None else records.training_pours
-        if records is not None:
-            _check_training_pours(train, at.at("from" if pours.source is not None else "from_run"), report)
         problems = PlacedProblems(place, report, frozenset(CalibrationSection.model_fields))
         settings = section.settings.settled(tuple(searched), train, problems)
-    if scene is None or len(others) < len(receivers) - 1 or actions is None or settings is None or not searched:
+    if scenes.first is None or len(scenes.further) < len(ground.receivers) - 1:
+        return None
+    if ground.actions is None or settings is None or not searched:
         return None
     return CalibrationPlan(
         settings=settings,
-        scene=scene,
-        actions=actions,
+        scene=scenes.first,
+        actions=ground.actions,
         constraints=ground.constraints,
         prior=prior,
         parameters=Space(tuple(searched.values())),
@@ -230,9 +208,74 @@ def resolve_calibration(
         transfer=transfer,
         random_baseline=section.random_baseline,
         parameter_prior=priors,
-        further=others,
-        tested=tested,
+        further=scenes.further,
+        tested=scenes.tested,
     )
+
+
+@dataclass(frozen=True)
+class _CalibrationScenes:
+    """Scenes of a calibration's pours.
+
+    Attributes:
+        first: with the first receiver; None after a problem.
+        further: with the other receivers.
+        tested: with the receivers that are held out for testing.
+    """
+
+    first: Scene | None
+    further: tuple[Scene, ...]
+    tested: tuple[Scene, ...]
+
+
+def _calibration_scenes(
+    pours: PoursSettings, at: Place, ground: StageGround, table: RecordTable | None
+) -> _CalibrationScenes:
+    """The scenes of a calibration; `at` is the place of its pours, `table` the file with them."""
+    report, receivers = ground.builder.report, ground.receivers
+    first = ground.scene(
+        "calibration",
+        receivers[0] if receivers else None,
+        recorded=not pours.are_made,
+        constants={} if table is None else table.constants(),
+        unread=table is None and (pours.source is not None or report.is_broken(at.at("from"))),
+    )
+    if first is None:
+        return _CalibrationScenes(None, (), _tested_scenes(pours, at, ground, None, ()))
+    others = [receiver for receiver in receivers[1:] if receiver is not None]
+    scenes = [ground.scene(f"calibration-{other.name}", other) for other in others]
+    if scenes and pours.source is not None:
+        text = "stands beside pours that are read 'from' a file, which were made into one; keep 'receiver'"
+        report.add(ground.place.at("receivers"), text, key=True)
+    further = tuple(scene for scene in scenes if scene is not None)
+    return _CalibrationScenes(first, further, _tested_scenes(pours, at, ground, first, further))
+
+
+def _existing_pours(
+    pours: PoursSettings,
+    at: Place,
+    ground: StageGround,
+    scenes: _CalibrationScenes,
+    table: RecordTable | None,
+    laboratory: LaboratorySettings | None,
+) -> tuple[RecordSet | None, RecordSet | None]:
+    """Pours from a file or an earlier run, and those of the transfer scene; None where there are none."""
+    builder, first = ground.builder, scenes.first
+    if pours.source is not None:
+        return resolve_records(pours, at, builder, table, ground.actions, first, ground.pourer, ground.motions)
+    if pours.from_run is None or first is None or ground.actions is None:
+        return None, None
+    poured, place = (first, *scenes.further, *scenes.tested), at.at("from_run")
+    return records_of_run(pours.from_run, place, poured, ground.actions, laboratory, builder.report), None
+
+
+def _check_that_bench_pours(
+    pours: PoursSettings, laboratory: LaboratorySettings | None, place: Place, report: Report
+) -> None:
+    """Check that pours which are to be made have a bench."""
+    if pours.count and laboratory is not None and not laboratory.pours:
+        text = f"laboratory '{laboratory.name}' has no bench to pour on; name a CSV file with 'from'"
+        report.add(place, text)
 
 
 def _tested_scenes(

@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+from dataclasses import dataclass
 from io import StringIO
 from itertools import chain
 from pathlib import Path
@@ -96,6 +97,104 @@ def _write_rack(entry: CommentedMap, rack: RackSettings) -> None:
             entry[key] = _pose(pose)
 
 
+@dataclass(frozen=True)
+class _Labware:
+    """A labware definition.
+
+    Attributes:
+        wells: x, y, z and depth of each, by name [mm].
+        tips: whether it is a rack of pipette tips.
+    """
+
+    path: Path
+    name: str
+    category: str
+    wells: dict[str, tuple[float, ...]]
+    tips: bool
+
+    @classmethod
+    def read(cls, path: Path) -> _Labware:
+        """Read a file; raises as `labware_rack`."""
+        try:
+            labware = json.loads(path.read_text(encoding="utf-8"))
+            if not {"wells", "metadata", "ordering"} - {*labware} and "schemaVersion" not in labware:
+                raise DecantError(f"{path}: is a labware definition of schema 1; 2 and 3 can be read")
+            schema, wells, meta = labware["schemaVersion"], labware["wells"], labware["metadata"]
+            category, name = str(meta["displayCategory"]), str(meta["displayName"])
+            cells = {key: tuple(float(well[axis]) for axis in ("x", "y", "z", "depth")) for key, well in wells.items()}
+            tips = bool(labware.get("parameters", {}).get("isTiprack"))
+            if not all(map(math.isfinite, chain.from_iterable(cells.values()))):
+                raise ValueError("a length is no number")
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise DecantError(
+                f"{path}: should be a labware definition of Opentrons with 'schemaVersion', 'metadata' and 'wells', "
+                f"each with x, y, z and depth ({type(error).__name__}: {error})"
+            ) from None
+        if schema not in (2, 3):
+            raise DecantError(f"{path}: has schemaVersion {schema!r}; 2 and 3 can be read")
+        return cls(path, name, category, cells, tips)
+
+    def check_that_vessels_stand_in_it(self) -> None:
+        """Raise DecantError if the wells are part of it, or hold nothing."""
+        path, name = self.path, self.name
+        if not self.wells:
+            raise DecantError(f"{path}: '{name}' has no wells, so that nothing stands in it; a rack has some")
+        if self.category not in RACKS or self.tips:
+            raise DecantError(
+                f"{path}: '{name}' has the displayCategory {self.category}: its wells are part of it, and no gripper "
+                f"can grip them or take them out; a rack has the displayCategory {' or '.join(RACKS[:2])}"
+            )
+        if flat := [key for key, (*_, depth) in self.wells.items() if depth <= 0.0]:
+            raise DecantError(
+                f"{path}: the depth of {flat[0]} of '{name}' is not more than 0, as that of a mark to calibrate with: "
+                "no vessel stands in it"
+            )
+
+    def grid(self) -> dict[str, float]:
+        """Rows, columns and pitches of its wells [m].
+
+        Raises:
+            DecantError: they are no regular grid, are counted from another side, or are too close for fingers.
+        """
+        path, name, cells = self.path, self.name, self.wells
+        positions = {key: re.fullmatch(r"([A-Z])([1-9]\d?)", key) for key in cells}
+        if "A1" not in cells or None in positions.values():
+            raise DecantError(
+                f"{path}: the wells of '{name}' should have names such as A1; they are {', '.join(cells)}"
+            )
+        at = {key: (ord(match[1]) - ord("A"), int(match[2]) - 1) for key, match in positions.items() if match}
+        rows, columns = (1 + max(index[k] for index in at.values()) for k in (0, 1))
+        x, y, z, _ = cells["A1"]
+        # with one row or column the other pitch is never used
+        row_pitch = y - cells["B1"][1] if "B1" in cells else 100.0
+        column_pitch = cells["A2"][0] - x if "A2" in cells else 100.0
+        for key in (position_name(row, column) for row in range(rows) for column in range(columns)):
+            row, column = at.get(key, (0, 0))
+            expected = (x + column * column_pitch, y - row * row_pitch, z)
+            if key not in cells or math.dist(cells[key][:3], expected) > ON_GRID:
+                beside = f"is {math.dist(cells[key][:3], expected):.1f} mm beside it" if key in cells else "is missing"
+                raise DecantError(
+                    f"{path}: '{name}' is not one regular grid: with the pitch of A1, A2 and B1, {key} {beside}. Make "
+                    "one place for each regular part"
+                )
+        for pitch, lines, second, where in (
+            (row_pitch, "rows", "B1", "y of A1 should be larger than that of B1"),
+            (column_pitch, "columns", "A2", "x of A2 should be larger than that of A1"),
+        ):
+            if pitch < 0.0:
+                raise DecantError(
+                    f"{path}: the {lines} of '{name}' are counted from the wrong side: seen from above, A1 is at the "
+                    f"back left and {second} the next one, so that {where}. Name the wells so"
+                )
+        if (narrowest := min(abs(row_pitch), abs(column_pitch))) < FINGERS:
+            raise DecantError(
+                f"{path}: the positions of '{name}' are {narrowest:.3g} mm apart, as those of a plate or of strips: no "
+                "fingers fit between them"
+            )
+        pitches = {"row_pitch": 1e-3 * row_pitch, "column_pitch": 1e-3 * column_pitch}
+        return {"rows": rows, "columns": columns, **pitches}
+
+
 def labware_rack(path: Path) -> tuple[RackSettings, float]:
     """The rack of a labware definition, and the height to which a vessel has to be lifted out of it [m].
 
@@ -103,74 +202,15 @@ def labware_rack(path: Path) -> tuple[RackSettings, float]:
         DecantError: it is no definition, its wells are no regular grid, or cannot be taken out; the text states why.
         OSError: it can't be read.
     """
+    labware = _Labware.read(path)
+    labware.check_that_vessels_stand_in_it()
+    grid = labware.grid()
+    lift = 1e-3 * labware.wells["A1"][3] + LIFT
     try:
-        labware = json.loads(path.read_text(encoding="utf-8"))
-        if not {"wells", "metadata", "ordering"} - {*labware} and "schemaVersion" not in labware:
-            raise DecantError(f"{path}: is a labware definition of schema 1; 2 and 3 can be read")
-        schema, wells, meta = labware["schemaVersion"], labware["wells"], labware["metadata"]
-        category, name = str(meta["displayCategory"]), str(meta["displayName"])
-        cells = {key: tuple(float(well[axis]) for axis in ("x", "y", "z", "depth")) for key, well in wells.items()}
-        tips = bool(labware.get("parameters", {}).get("isTiprack"))
-        if not all(map(math.isfinite, chain.from_iterable(cells.values()))):
-            raise ValueError("a length is no number")
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise DecantError(
-            f"{path}: should be a labware definition of Opentrons with 'schemaVersion', 'metadata' and 'wells', each "
-            f"with x, y, z and depth ({type(error).__name__}: {error})"
-        ) from None
-    if schema not in (2, 3):
-        raise DecantError(f"{path}: has schemaVersion {schema!r}; 2 and 3 can be read")
-    if not cells:
-        raise DecantError(f"{path}: '{name}' has no wells, so that nothing stands in it; a rack has some")
-    if category not in RACKS or tips:
-        raise DecantError(
-            f"{path}: '{name}' has the displayCategory {category}: its wells are part of it, and no gripper can grip "
-            f"them or take them out; a rack has the displayCategory {' or '.join(RACKS[:2])}"
-        )
-    if flat := [key for key, (*_, depth) in cells.items() if depth <= 0.0]:
-        raise DecantError(
-            f"{path}: the depth of {flat[0]} of '{name}' is not more than 0, as that of a mark to calibrate with: no "
-            "vessel stands in it"
-        )
-    positions = {key: re.fullmatch(r"([A-Z])([1-9]\d?)", key) for key in cells}
-    if "A1" not in cells or None in positions.values():
-        raise DecantError(f"{path}: the wells of '{name}' should have names such as A1; they are {', '.join(cells)}")
-    at = {key: (ord(match[1]) - ord("A"), int(match[2]) - 1) for key, match in positions.items() if match}
-    rows, columns = (1 + max(index[k] for index in at.values()) for k in (0, 1))
-    x, y, z, depth = cells["A1"]
-    # with one row or column the other pitch is never used
-    row_pitch = y - cells["B1"][1] if "B1" in cells else 100.0
-    column_pitch = cells["A2"][0] - x if "A2" in cells else 100.0
-    for key in (position_name(row, column) for row in range(rows) for column in range(columns)):
-        row, column = at.get(key, (0, 0))
-        expected = (x + column * column_pitch, y - row * row_pitch, z)
-        if key not in cells or math.dist(cells[key][:3], expected) > ON_GRID:
-            where = "is missing" if key not in cells else f"is {math.dist(cells[key][:3], expected):.1f} mm beside it"
-            raise DecantError(
-                f"{path}: '{name}' is not one regular grid: with the pitch of A1, A2 and B1, {key} {where}. Make one "
-                "place for each regular part"
-            )
-    for pitch, lines, second, where in (
-        (row_pitch, "rows", "B1", "y of A1 should be larger than that of B1"),
-        (column_pitch, "columns", "A2", "x of A2 should be larger than that of A1"),
-    ):
-        if pitch < 0.0:
-            raise DecantError(
-                f"{path}: the {lines} of '{name}' are counted from the wrong side: seen from above, A1 is at the "
-                f"back left and {second} the next one, so that {where}. Name the wells so"
-            )
-    if (narrowest := min(abs(row_pitch), abs(column_pitch))) < FINGERS:
-        raise DecantError(
-            f"{path}: the positions of '{name}' are {narrowest:.3g} mm apart, as those of a plate or of strips: no "
-            "fingers fit between them"
-        )
-    values = {"rows": rows, "columns": columns, "row_pitch": 1e-3 * row_pitch, "column_pitch": 1e-3 * column_pitch}
-    lift = 1e-3 * depth + LIFT
-    try:
-        rack = RackSettings.model_validate(values)
+        rack = RackSettings.model_validate(grid)
         PlaceSettings(name="rack", pose=Pose(), tool=Pose(), rack=rack, approach=max(lift, LEAST_APPROACH))
     except ValidationError as error:
-        raise DecantError(f"{path}: '{name}' {first_problem(error)}") from None
+        raise DecantError(f"{path}: '{labware.name}' {first_problem(error)}") from None
     return rack, lift
 
 

@@ -6,8 +6,8 @@ value.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, field
 from typing import Any
 
 from actors.optimizer.questions import Linear
@@ -32,7 +32,27 @@ NEEDED = ("angular_velocity", "max_angle", "x_offset", "height")
 LEAST_LEFT = 64
 """Minimum number of actions, out of about 30,000 spread over the ranges, that must satisfy the constraints."""
 
-DEFAULTS = Action(angular_velocity=1.0, x_offset=0.0, height=0.0).values()
+DEFAULTS = {
+    name: value
+    for name, value in Action(angular_velocity=1.0, x_offset=0.0, height=0.0).values().items()
+    if name not in NEEDED
+}
+"""Values of the other dimensions where a campaign states none."""
+
+
+@dataclass
+class _StatedMotion:
+    """The motion of a scene as the file states it, with the default of what it does not state.
+
+    Attributes:
+        fixed: dimensions of the action that are not searched.
+        origin: where the file states them.
+    """
+
+    fixed: dict[str, float | None] = field(default_factory=DEFAULTS.copy)
+    origin: dict[str, Place] = field(default_factory=dict)
+    pivot: Pivot = field(default_factory=Pivot)
+    max_hold_time: float = 5.0
 
 
 @dataclass
@@ -154,47 +174,64 @@ class SceneBuilder:
             constants_win: the record's scene only inherits the motion, so that its constants have priority.
             unread: the record could not be read, so that dimensions that it may give are not missed.
         """
-        fixed: dict[str, float | None] = {k: v for k, v in DEFAULTS.items() if k not in NEEDED}
-        pivot, max_hold_time = Pivot(), 5.0
-        origin: dict[str, Place] = {}
-        for motion, at in ((self.file.motion, self.root.at("motion")), *motions):
-            if motion is None:
-                continue
-            stated_here = motion.fixed()
-            fixed |= stated_here
-            origin |= {dimension: at.at(dimension) for dimension in stated_here}
-            pivot = motion.pivot_value() or pivot
-            max_hold_time = max_hold_time if motion.max_hold_time is None else motion.max_hold_time
-        ok = True
-        for dimension, value in (constants or {}).items():
-            stated = fixed.get(dimension)
-            if dimension in origin and not constants_win and (stated is None or abs(stated - value) > 1e-6):
-                ok = False
-                info = ACTION_DIMENSIONS[dimension]
-                shown = f"{value / info.factor:g} {info.display_unit}"
-                self.report.add(origin[dimension], f"the weighed pours were all made at {shown}; remove this key")
-            fixed[dimension] = value
-        fixed = {dimension: value for dimension, value in fixed.items() if dimension not in searched}
-        for dimension in NEEDED:
-            if dimension not in fixed and dimension not in searched:
-                ok = False
-                if not unread and not self.hidden_by_problems(place, dimension):
-                    self.report.add(place, self._needs(dimension, place), key=True)
-        for dimension in ("angular_acceleration", "return_velocity"):
-            if not recorded and dimension in fixed and fixed[dimension] is None:
-                ok = False
-                word, example = ACTION_DIMENSIONS[dimension].switched_off, EXAMPLES[dimension]
-                self.report.add(
-                    origin[dimension],
-                    f"'{word}' only replays recorded pours, no arm can do it; write for example '{example}' "
-                    f"(or override it under {dotted(place.at('motion').loc)})",
-                )
-        if pourer is None or receiver is None or self.liquid is None or not ok:
+        stated = self._stated_motion(motions)
+        constants = constants or {}
+        fixed = {name: value for name, value in {**stated.fixed, **constants}.items() if name not in searched}
+        checks = (
+            constants_win or self._constants_fit(constants, stated),
+            self._nothing_missing({*fixed, *searched}, place, unread=unread),
+            recorded or self._arm_can_do(fixed, stated, place),
+        )
+        if pourer is None or receiver is None or self.liquid is None or not all(checks):
             return None
         simulated = self.file.calibration is not None or self.file.deployment is not None
         half = simulated and self.file.simulator.mirrors and fixed.get("y_offset") == 0.0
         mirrored = True if half else None
-        return Scene(name, pourer, receiver, self.liquid, pivot, fixed, max_hold_time, mirrored)
+        return Scene(name, pourer, receiver, self.liquid, stated.pivot, fixed, stated.max_hold_time, mirrored)
+
+    def _stated_motion(self, motions: tuple[tuple[MotionBase | None, Place], ...]) -> _StatedMotion:
+        """The campaign's motion with the sections that override it; the last has priority."""
+        stated = _StatedMotion()
+        for motion, at in ((self.file.motion, self.root.at("motion")), *motions):
+            if motion is not None:
+                own = motion.fixed()
+                stated.fixed |= own
+                stated.origin |= {dimension: at.at(dimension) for dimension in own}
+                stated.pivot = motion.pivot_value() or stated.pivot
+                stated.max_hold_time = stated.max_hold_time if motion.max_hold_time is None else motion.max_hold_time
+        return stated
+
+    def _constants_fit(self, constants: Mapping[str, float], stated: _StatedMotion) -> bool:
+        """Check that the motion states no other value than all pours of a record have."""
+        fit = True
+        for dimension, value in constants.items():
+            own = stated.fixed.get(dimension)
+            if dimension in stated.origin and (own is None or abs(own - value) > 1e-6):
+                fit, info = False, ACTION_DIMENSIONS[dimension]
+                shown = f"{value / info.factor:g} {info.display_unit}"
+                text = f"the weighed pours were all made at {shown}; remove this key"
+                self.report.add(stated.origin[dimension], text)
+        return fit
+
+    def _nothing_missing(self, dimensions: Set[str], place: Place, *, unread: bool) -> bool:
+        """Check that the dimensions without a default are fixed or searched; `unread` as in `scene`."""
+        missing = [name for name in NEEDED if name not in dimensions]
+        for name in () if unread else missing:
+            if not self.hidden_by_problems(place, name):
+                self.report.add(place, self._needs(name, place), key=True)
+        return not missing
+
+    def _arm_can_do(self, fixed: Mapping[str, float | None], stated: _StatedMotion, place: Place) -> bool:
+        """Check that the motion has a finite acceleration and a return."""
+        switched_off = [d for d in ("angular_acceleration", "return_velocity") if d in fixed and fixed[d] is None]
+        for dimension in switched_off:
+            word, example = ACTION_DIMENSIONS[dimension].switched_off, EXAMPLES[dimension]
+            self.report.add(
+                stated.origin[dimension],
+                f"'{word}' only replays recorded pours, no arm can do it; write for example '{example}' "
+                f"(or override it under {dotted(place.at('motion').loc)})",
+            )
+        return not switched_off
 
     def pourer(self, value: Any, place: Place) -> VesselSpec | None:
         """A section's pourer, or the campaign's."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,14 +70,7 @@ def posterior_of(directory: Path, record: RunState | None = None) -> KnownPoster
     if not rows:
         raise NoPosteriorError(f"{name}: its calibration has no posterior of the parameters; C4 has one")
     memory = encoded.get("memory") or {}
-    alone = {key: (entry["mean"], entry["deviation"]) for key, entry in (memory.get("alone") or {}).items()}
-    told = alone or {key: (entry.mean, entry.deviation) for key, entry in estimates(rows).items()}
-    priors = {entry["name"]: entry for entry in calibration.get("parameter_prior", ())}
-    parameters = {}
-    for axis in (Axis(**row) for row in calibration["parameters"]["axes"]):
-        estimate = _without_range(*told[axis.name], axis, priors.get(axis.name))
-        if estimate is not None and group_of(axis.name) is not None:
-            parameters[axis.name] = {"mean": estimate[0], "deviation": estimate[1]}
+    parameters = _estimated_parameters(calibration, memory, rows)
     if not parameters:
         raise NoPosteriorError(f"{name}: its pours leave all parameters open")
     scene, liquid = calibration["scene"], Liquid.model_validate(calibration["scene"]["liquid"])
@@ -103,15 +96,37 @@ def posterior_of(directory: Path, record: RunState | None = None) -> KnownPoster
             "pours": int(encoded.get("training_pours", 0)),
             "fixed": {key: float(value) for key, value in calibration["fixed_parameters"].items()},
             "parameters": parameters,
-            "contradicts": [
-                run
-                for group in memory.get("groups", ())
-                if group["group"] == PLACEMENT and group["contradicted"]
-                for run in group["runs"]
-            ],
+            "contradicts": _contradicted_runs(memory),
             "weighed": [WeighedPairSettings.of(pair) for pair in _weighed_pairs(calibration, results)],
         }
     )
+
+
+def _estimated_parameters(
+    calibration: Mapping[str, Any], memory: Mapping[str, Any], rows: Sequence[Mapping[str, float]]
+) -> dict[str, dict[str, float]]:
+    """Moments of the searched parameters from the pours alone; without those that the pours leave open.
+
+    Args:
+        calibration: its plan in the run's fingerprint.
+        memory: how the calibration used a prior from earlier campaigns; empty without one.
+        rows: draws of the posterior.
+    """
+    alone = {key: (entry["mean"], entry["deviation"]) for key, entry in (memory.get("alone") or {}).items()}
+    moments = alone or {key: (entry.mean, entry.deviation) for key, entry in estimates(rows).items()}
+    priors = {entry["name"]: entry for entry in calibration.get("parameter_prior", ())}
+    parameters = {}
+    for axis in (Axis(**row) for row in calibration["parameters"]["axes"]):
+        estimate = _without_range(*moments[axis.name], axis, priors.get(axis.name))
+        if estimate is not None and group_of(axis.name) is not None:
+            parameters[axis.name] = {"mean": estimate[0], "deviation": estimate[1]}
+    return parameters
+
+
+def _contradicted_runs(memory: Mapping[str, Any]) -> list[str]:
+    """Earlier runs whose placement the pours contradict."""
+    groups = [group for group in memory.get("groups", ()) if group["group"] == PLACEMENT and group["contradicted"]]
+    return [run for group in groups for run in group["runs"]]
 
 
 def _weighed_pairs(calibration: Mapping[str, Any], results: Iterable[Mapping[str, Any]]) -> list[WeighedPair]:

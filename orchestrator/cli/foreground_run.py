@@ -247,15 +247,7 @@ def run_at_terminal(
         way_on = _way_on(directory, again(directory), not_resumed)
         raise RefusalError(f"{file_trouble(error, directory)}{way_on}", FAILED) from None
     except (asyncio.CancelledError, KeyboardInterrupt):
-        if done := finished_without_report(directory):
-            way_on = done
-        elif not_resumed:
-            unknown = "".join(
-                f" while {pour} was under way: what it poured is unknown" for pour in given_up_pours(directory)
-            )
-            way_on = unknown + _way_on(directory, again(directory), not_resumed)
-        else:
-            way_on = interruption(directory, plan, again(directory))
+        way_on = _after_interruption(directory, plan, again(directory), not_resumed)
         raise RefusalError(f"interrupted{way_on}", INTERRUPTED) from None
     finally:
         if result is None:
@@ -295,6 +287,16 @@ def _way_on(directory: Path, again: str, not_resumed: str) -> str:
     if not (directory / JOURNAL_NAME).is_file():
         return "\nnothing had begun"
     return f"\n{not_resumed} is in {directory}. {again}" if not_resumed else f"\nwhat is done so far is kept: {again}"
+
+
+def _after_interruption(directory: Path, plan: CampaignPlan, again: str, not_resumed: str) -> str:
+    """Follows 'interrupted': what is kept of a run, and how to go on."""
+    if done := finished_without_report(directory):
+        return done
+    if not not_resumed:
+        return interruption(directory, plan, again)
+    unknown = [f" while {pour} was under way: what it poured is unknown" for pour in given_up_pours(directory)]
+    return "".join(unknown) + _way_on(directory, again, not_resumed)
 
 
 async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], *, resumable: bool) -> CampaignResult:

@@ -64,8 +64,6 @@ def simulate(
     the picture. 'prediction' contains means and standard deviations of all seeds, and the interval that should contain
     nine pours in ten.
     """
-    from actors.arm.pour_feasibility import path_of
-    from actors.interfaces import InvalidActionError
     from orchestrator.campaigns.file_loading import load_discrepancy, load_parameters, load_vessel
     from orchestrator.cli.foreground_run import read_campaign, read_draws
     from sim_engine.prediction_band import band_of, spreads
@@ -87,11 +85,7 @@ def simulate(
     with Refused(InvalidSceneError, at="with shapes that the vessels may have, " if scene.uncertain else ""):
         for task in tasks if scene.uncertain else tasks[:1]:  # refuse before Taichi starts
             simulator.prepare(task)
-    if plan.laboratory.arm is not None:
-        try:
-            path_of(scene, action, plan.laboratory.expected_arm)
-        except InvalidActionError as error:
-            print_warning(f"{action.display()}: {error}")
+    _warn_of_arm(plan, scene, action)
     regime = _regimes(tasks[0])
     runs = _simulated_pour(simulator, tasks)
     outcomes = [run.outcome for run in runs]
@@ -128,6 +122,18 @@ def simulate(
     bad = [f"seed {o.seed}: this outcome must not be used: {o.invalid}" for o in outcomes if o.invalid is not None]
     if bad:
         raise RefusalError("\n".join(bad), FAILED)
+
+
+def _warn_of_arm(plan: CampaignPlan, scene: Scene, action: Action) -> None:
+    """Warn of an action that the laboratory's arm can't make."""
+    from actors.arm.pour_feasibility import path_of
+    from actors.interfaces import InvalidActionError
+
+    if plan.laboratory.arm is not None:
+        try:
+            path_of(scene, action, plan.laboratory.expected_arm)
+        except InvalidActionError as error:
+            print_warning(f"{action.display()}: {error}")
 
 
 def scene_and_action(
