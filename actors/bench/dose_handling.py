@@ -41,7 +41,7 @@ from actors.bench.vessel_carrying import (
 )
 from actors.bench.vessel_handling import WRONG, plan_emptying
 from actors.dosing.dose_estimator import DoseReading
-from actors.dosing.dose_series import LOST, source_of
+from actors.dosing.dose_series import source_of
 from actors.grippers.gripper_interface import GripperSettings
 from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, LaboratoryError, OperatorQuestion
 from actors.places import CellVessel, Layout, PlaceRecord, PlaceSettings, Role
@@ -570,7 +570,12 @@ class DoseHandling:
         self._liquids.enter(source, of.mass, of.deviation, scene.liquid.name)
 
     async def finish(
-        self, consent: MotionConsent, scene: Scene, dose: DoseTarget, amount: tuple[float, float]
+        self,
+        consent: MotionConsent,
+        scene: Scene,
+        dose: DoseTarget,
+        amount: tuple[float, float],
+        lost: tuple[float, float],
     ) -> CarriedDose:
         """Put the source back, weigh the cup, and put it back unless the next dose goes into it.
 
@@ -579,6 +584,7 @@ class DoseHandling:
             scene: vessels and liquid.
             dose: wanted amount.
             amount: dosed, and its standard deviation [kg].
+            lost: from the source beyond it, and its standard deviation [kg].
         """
         source, cup = self.names(scene, dose)
         assert self._tare is not None
@@ -586,9 +592,9 @@ class DoseHandling:
         self._record.add_component(cup, scene.liquid.name, *amount, source)
         self._liquids.enter(cup, content[0] + amount[0], math.hypot(content[1], amount[1]), self._mixture(cup))
         of = source_of(scene, dose)
-        left = max(of.mass - amount[0] - LOST[0], 0.0), math.hypot(of.deviation, LOST[1])
+        left = max(of.mass - amount[0] - lost[0], 0.0), math.hypot(of.deviation, lost[1])
         self._liquids.enter(source, *left, scene.liquid.name)
-        self._liquids.spilled(*LOST)
+        self._liquids.spilled(*lost)
         self._liquids.enter_tray(scene.liquid.name)
         carrier = self._carrier
         back = f"put {label(source)} back" + ("" if dose.stays else f", and {label(cup)} once it is weighed")

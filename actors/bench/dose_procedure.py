@@ -34,7 +34,15 @@ from actors.bench.ground_truth import FASTEST_DOSE
 from actors.bench.pour_procedure import BenchProcedure, CheckpointProgress, largest_tilt
 from actors.dosing.dose_controller import DoseController, DoseOrder, DoseResult, check_display
 from actors.dosing.dose_estimator import DoseReading
-from actors.dosing.dose_series import DoseSeries, after_dose, check_dose, series_of, source_of, unknown_amount
+from actors.dosing.dose_series import (
+    DoseSeries,
+    after_dose,
+    check_dose,
+    lost_by,
+    series_of,
+    source_of,
+    unknown_amount,
+)
 from actors.dosing_settings import DosingSettings
 from actors.interfaces import (
     DoseTarget,
@@ -144,14 +152,16 @@ class DoseProcedure(BenchProcedure):
             if result.amount is None:
                 raise UnknownPourError(unknown_amount(result))
             if setup.doses is not None:
-                carried = await self._finish(setup.doses, (result.amount, result.deviation))
+                carried = await self._finish(setup.doses, (result.amount, result.deviation), lost_by(result))
         self._report.enter("record", 1.0)
         return self._measurement(result, {**carried, **truth})
 
-    async def _finish(self, handling: DoseHandling, amount: tuple[float, float]) -> dict[str, Any]:
+    async def _finish(
+        self, handling: DoseHandling, amount: tuple[float, float], lost: tuple[float, float]
+    ) -> dict[str, Any]:
         """Have the vessels put back. The dose is weighed: what goes wrong now does not make it unknown."""
         try:
-            return (await handling.finish(self._consent, self._scene, self._dose, amount)).record
+            return (await handling.finish(self._consent, self._scene, self._dose, amount, lost)).record
         except LaboratoryError as error:
             handling.forget()
             if self._setup.night is not None:

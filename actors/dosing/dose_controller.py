@@ -29,7 +29,7 @@ from actors.arm.arm_interface import NEWS_TIMEOUT
 from actors.balance.display_quality import FLOW_ERROR, dose_tolerance
 from actors.dosing.cup_flow import LARGEST_TILT, CupFlow, Floats, median, quantile
 from actors.dosing.display_belief import DisplayBelief
-from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading
+from actors.dosing.dose_estimator import LARGEST_CHANGE, DoseBelief, DoseEstimator, DoseReading
 from actors.dosing.dose_readings import RISES, DoseReadings
 from actors.dosing.tilt_command import CommandedArm, TiltCommand
 from actors.dosing_settings import DosingSettings
@@ -59,6 +59,7 @@ class DoseResult:
         top_ups: number of times that the cup was tilted again.
         belief: for the next dose.
         innovations: mean squared innovation, see `DoseEstimator`.
+        missing: left the cup and did not arrive, if the stream missed the receiver [kg].
     """
 
     end: DoseEnd
@@ -68,6 +69,7 @@ class DoseResult:
     top_ups: int
     belief: DoseBelief
     innovations: float
+    missing: float = 0.0
 
 
 FINE_WEBER = 0.8
@@ -193,6 +195,10 @@ DRIBBLES = 0.3e-3
 """Mass that arrives late in addition, where the last stream is too slow to leave the lip cleanly [kg]: about half of
 what runs down the outside. Later doses know it from the ones before."""
 
+ASTRAY = (5e-3, 0.5)
+"""Estimated mass past the lip beyond the weighed one from which the stream misses the receiver: [kg], and at least such
+a part of the estimate. After a pause the flow was known to half: prior flow factors scatter by 20 %."""
+
 LONGEST_SETTLING = (10.0, 15.0)
 """Time without rest of the balance after which the amount is unknown: [s], and at least so many readings."""
 
@@ -200,23 +206,28 @@ LONGEST_CHECK = (4.0, 8.0)
 """The same before the dose."""
 
 
-class LatestStream:
-    """The slowest plausible stream of a dose; a reading far behind it misses liquid.
+class PriorStream:
+    """The stream of a dose without its readings: the expected one, or the slowest plausible one, of which a reading far
+    behind it misses liquid.
 
     Args:
         cup: flow of the source vessel.
         belief: from the doses before.
+        slowest: whether it is the slowest plausible one.
 
     Attributes:
         mass: past the lip [kg].
         flow: now [kg/s].
     """
 
-    def __init__(self, cup: CupFlow, belief: DoseBelief) -> None:
+    def __init__(self, cup: CupFlow, belief: DoseBelief, *, slowest: bool) -> None:
         self._cup = cup
-        self._volume = float(belief.volume.mean() - 2.0 * belief.volume.std())
-        self._onset = float(belief.onset_bias.mean() + max(2.0 * belief.onset_bias.std(), LATEST_ONSET))
-        self._factor = 0.7 * median(belief.flow_factor)
+        self._volume, self._onset = float(belief.volume.mean()), float(belief.onset_bias.mean())
+        self._factor = median(belief.flow_factor)
+        if slowest:
+            self._volume -= 2.0 * float(belief.volume.std())
+            self._onset += max(2.0 * float(belief.onset_bias.std()), LATEST_ONSET)
+            self._factor *= 0.7
         self.mass = self.flow = 0.0
 
     def advance(self, seconds: float, tilt: float, amount: float) -> None:
@@ -299,7 +310,7 @@ class DoseController:
         self._belief = belief
         self._readings = DoseReadings(belief.display, self._estimator.repeats, step=step, noise=noise)
         self._arm = CommandedArm(settings)
-        self._latest = LatestStream(cup, belief)
+        self._latest, self._usual = (PriorStream(cup, belief, slowest=slowest) for slowest in (True, False))
         self._return_path = Return()
         self.phase = DosePhase.CHECK
         self.result: DoseResult | None = None
@@ -315,6 +326,8 @@ class DoseController:
         self._unchanged_since = 0.0
         self._expected: float | None = None  # amount for which the return was ordered [kg]
         self._before_silence: float | None = None
+        self._departed = 0.0  # largest estimated mass past the lip before the weighing [kg]
+        self._missing = 0.0  # of it, what has not arrived [kg]
         self._end: DoseEnd | None = None
         self._suspected: DoseEnd | None = None
         self._paused = self._doubted = False
@@ -374,7 +387,10 @@ class DoseController:
         else:
             self._estimator.advance(time, tilt)
             if self.phase is not DosePhase.DONE and seconds > 0.0:
-                self._latest.advance(seconds, tilt, self.amount[0])
+                for stream in (self._latest, self._usual):
+                    stream.advance(seconds, tilt, self.amount[0])
+                if self.phase is not DosePhase.SETTLE:
+                    self._departed = max(self._departed, self.amount[0])
         if pours and self.flow > 0.0:
             self._readings.track_zero(seconds)
         self._arm.arrive(time, tilt)
@@ -536,8 +552,11 @@ class DoseController:
         self._before_silence = None
         # within one step of the display, the particles know more than it shows
         likely = min(max(float(self._estimator.mass.mean()), amount - step), amount + step)
-        if self._suspected is not None and self._latest.lacks(amount):
-            self._end = self._end or self._suspected
+        missing = max(self._departed, self._latest.mass) - amount
+        astray = self._doubted and missing > max(ASTRAY[0], ASTRAY[1] * self._departed)
+        if astray or (self._suspected is not None and (self._flows_less() or self._latest.lacks(amount))):
+            self._end = self._end or self._suspected or self._lost_stream()
+            self._missing = max(missing, self._usual.mass - amount) if self._end is DoseEnd.STREAM_MISSED else 0.0
         smallest = max(self._settings.smallest_top_up, 1.5 * step)
         if self._end is None and self._order.amount - likely > smallest:
             paused = self._pauses if self._paused else self._top_ups
@@ -550,7 +569,7 @@ class DoseController:
                 self._rising, self._doubt_since, self._suspected, self._paused = 0, None, None, False
                 self._doubted = False
                 self._unchanged_since, self._estimator.repeats.run = self._arm.now, 0.0
-                self._latest.mass = amount
+                self._latest.mass = self._usual.mass = self._departed = amount
                 self._enter(DosePhase.APPROACH)
                 return
             self._end = DoseEnd.SHORT
@@ -577,6 +596,7 @@ class DoseController:
             self._top_ups,
             self._estimator.belief(weighed=weighed, aim=aim),
             self._estimator.innovations,
+            self._missing,
         )
 
     # ---- flow
@@ -709,7 +729,7 @@ class DoseController:
 
     def _flows_less(self) -> bool:
         """Whether far less flows than in the doses before."""
-        return median(self._estimator.flow_factor) < 0.3 * median(self._belief.flow_factor)
+        return median(self._estimator.flow_factor) * LARGEST_CHANGE < median(self._belief.flow_factor)
 
     def _lost_stream(self) -> DoseEnd:
         """Why less arrives than should have left the cup."""

@@ -340,6 +340,11 @@ def unknown_amount(result: DoseResult) -> str:
     )
 
 
+def lost_by(result: DoseResult) -> tuple[float, float]:
+    """Mass that a dose took from its source beyond the weighed amount: mean and standard deviation [kg]."""
+    return LOST[0] + result.missing, math.hypot(LOST[1], 0.5 * result.missing)
+
+
 def after_dose(series: DoseSeries, result: DoseResult) -> dict[str, Any]:
     """What a dose has shown, JSON-ready: its end, the content of its source, and the estimates for the next dose.
 
@@ -347,14 +352,15 @@ def after_dose(series: DoseSeries, result: DoseResult) -> dict[str, Any]:
         series: that the dose belongs to, after it.
         result: of the dose.
     """
-    content = series.content
+    content, (lost, deviation) = series.content, lost_by(result)
     return {
         "received": result.amount,
         "deviation": result.deviation,
         "end": str(result.end),
+        "missing": result.missing,
         "top_ups": result.top_ups,
         "innovations": result.innovations,
-        "left": [max(content.mass - LOST[0], 0.0), math.hypot(content.deviation, LOST[1])],
+        "left": [max(content.mass - lost, 0.0), math.hypot(content.deviation, deviation)],
         "knowledge": asdict(series.belief.knowledge()),
     }
 

@@ -243,6 +243,6 @@ def dose_text(dose: Dose) -> str:
     time = "" if dose.duration_s is None else f" after {dose.duration_s:.1f} s"
     error = dose.received_g - dose.wanted_g
     end = f"; {dose.outcome_text}" if dose.outcome == "missed" or dose.by_hand else ""
-    end += "" if dose.end in (DoseEnd.MISSED, DoseEnd.REACHED) else f"; {dose.end}"
+    end += "" if dose.end in (DoseEnd.MISSED, DoseEnd.REACHED) else f"; {dose.end_text}"
     sure = "" if dose.half_interval_g is None else f" ± {dose.half_interval_g:.1f} g"
     return f"dose {dose.number}, {dose.wanted_g:g} g: {dose.received_g:.1f} g{sure} weighed ({error:+.1f} g){time}{end}"

@@ -189,8 +189,16 @@ class Dose(ResultPart):
     left_deviation_g: float | None = None
     """Standard deviation of this content [g]."""
 
+    missing_g: float = 0.0
+    """Estimated to have left the source without arriving in the receiver [g], if the stream missed it."""
+
     signals: DoseSignals = DoseSignals()
     """Signals over time."""
+
+    @property
+    def end_text(self) -> str:
+        """The end, as 'stream misses the receiver: about 8 g of it'."""
+        return f"{self.end}: about {self.missing_g:.0f} g of it" if self.missing_g else self.end
 
     @property
     def missed_by_g(self) -> float | None:
@@ -514,6 +522,7 @@ class Dispense:
             filled=pour.dose.source.fill,
             left_g=None if left is None else 1e3 * left.mass,
             left_deviation_g=None if left is None else 1e3 * left.deviation,
+            missing_g=1e3 * about.get("missing", 0.0),
             signals=DoseSignals(**{name: about.get(name, ()) for name in DoseSignals.model_fields}),
         )
         self._doses.append(dose)

@@ -433,11 +433,13 @@ def _liquid(record: RunState, weighed: Sequence[PourMeasurement]) -> str:
     text = f"{delivered:.0f} g delivered"
     if spilled := sum(each.spilled_g or 0.0 for each in masses):
         text += f", {spilled:.1f} g spilled"
-    unweighed = sum(
-        each.spilled_g is None and not entered_by_hand(pour) for each, pour in zip(masses, weighed, strict=True)
-    )
-    estimate = 1e3 * LOST[0] * unweighed
-    count = f"{unweighed} dose{'' if unweighed == 1 else 's'}"
+    unweighed = [
+        LOST[0] + measured.notes.get("dose", {}).get("missing", 0.0)
+        for each, measured in zip(masses, weighed, strict=True)
+        if each.spilled_g is None and not entered_by_hand(measured)
+    ]
+    estimate = 1e3 * sum(unweighed)
+    count = f"{len(unweighed)} dose{'' if len(unweighed) == 1 else 's'}"
     return f"{text}; spilled by {count}: not weighed, {estimate:.0f} g by estimate" if unweighed else text
 
 
@@ -722,7 +724,7 @@ def _dose_table(stage: str, dispensed: Dispensed) -> ResultTable:
         cells += ["—" if dose.spilled_g is None else f"{dose.spilled_g:.2f}"]
         cells += ["—" if dose.duration_s is None else f"{dose.duration_s:.1f}", dose.source or "—"]
         cells += ["—" if dose.left_g is None else f"{dose.left_g:.0f} ± {2.0 * (dose.left_deviation_g or 0.0):.1f}"]
-        cells += [dose.outcome_text or "—", f"{dose.end}{', source filled before' if dose.filled else ''}"]
+        cells += [dose.outcome_text or "—", f"{dose.end_text}{', source filled before' if dose.filled else ''}"]
         rows.append(ResultRow(cells, "bad" if dose.received_g is None or dose.outcome == "missed" else ""))
     header = ["dose", "position", "wanted [g]", "received [g]", "difference [g]", "± (90 %) [g]", "spilled [g]"]
     header += ["time [s]", "source", "left [g]", "outcome", "end"]

@@ -24,9 +24,16 @@ from actors.dosing.dose_controller import (
     fine_flow,
 )
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, calibrated_knowledge, draw_lags
-from actors.dosing.dose_series import DoseSeries, SourceContent
+from actors.dosing.dose_series import DoseSeries, SourceContent, after_dose
 from actors.dosing.tilt_command import TiltCommand
-from actors.dosing.virtual_dosing_bench import DoseRecord, DosingFault, TrueCup, TrueScale, VirtualDosingBench
+from actors.dosing.virtual_dosing_bench import (
+    DoseRecord,
+    DosingFault,
+    LivePour,
+    TrueCup,
+    TrueScale,
+    VirtualDosingBench,
+)
 from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseEnd, InvalidActionError
 from sim_engine.hydrostatics import level, tilting_cup_outflow
@@ -38,6 +45,7 @@ WATER = Liquid(mass=0.3)
 BEAKER = build_vessel(cylinder("beaker", inner_radius=0.04, inner_height=0.10))
 CUP = CupFlow(BEAKER, WATER)
 SPOUTED = TrueCup(0.040, 0.100, 0.007, 0.014)
+NORMALS = np.random.default_rng(0).standard_normal(1000).tolist()
 POURED = (DoseEnd.REACHED, DoseEnd.MISSED)  # nothing stopped the dose; a slow balance misses 1 g at times
 
 
@@ -355,6 +363,42 @@ def test_a_stream_beside_the_receiver_is_stopped() -> None:
     assert controller.result is not None
     assert controller.result.end is DoseEnd.STREAM_MISSED
     assert record.spilled < 0.08  # before the first dose the onset is known to 1.2° only, 8 g per degree
+
+
+class PartlyBeside(LivePour):
+    """A stream of which a share arrives in the receiver."""
+
+    share = 0.1
+
+    def step(self, tilt: float, turned: float, *, missed: bool = False) -> float:
+        before = self.received
+        load = super().step(tilt, turned, missed=missed)
+        beside = (1.0 - self.share) * (self.received - before)
+        self.received, self.spilled = self.received - beside, self.spilled + beside
+        return load - beside
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_a_stream_that_arrives_in_part_is_stopped_at_the_first_weighing_and_its_rest_is_missing(share: float) -> None:
+    def stream(bench: VirtualDosingBench) -> PartlyBeside:
+        pour = PartlyBeside(bench, 0, NORMALS)
+        pour.share = share
+        return pour
+
+    bench = VirtualDosingBench(SPOUTED, WATER, TrueScale(lag=0.3), 1, poured=stream)
+    placed, rng = bench.place_receiver(), np.random.default_rng(1)
+    series = DoseSeries(CUP, DosingSettings(), SourceContent(0.3), placed, rng)
+    controller = series.controller(DoseOrder(0.1, receiver_mass=bench.receiver_mass), seed=1)
+    entered, enter = list[DosePhase](), controller._enter
+    controller._enter = lambda phase: (entered.append(phase), enter(phase))  # type: ignore[func-returns-value]
+    record, result = bench.dose(controller), controller.result
+    assert result is not None
+    assert result.end is DoseEnd.STREAM_MISSED
+    assert entered.count(DosePhase.SETTLE) == 1
+    assert 5e-3 < result.missing < record.spilled
+    series.finish(result)
+    mass, deviation = after_dose(series, result)["left"]
+    assert bench.content == pytest.approx(mass, abs=3.0 * deviation)
 
 
 def test_an_empty_source_ends_the_dose_short() -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from actors.dosing.dose_estimator import ONSET
 from actors.interfaces import DoseSource
+from orchestrator.cli.dose_command import dose_text
 from orchestrator.learning.calibration.calibration_base import Calibrated
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.learning.dispense import Dispense, KnownSource, SourcesRead
@@ -18,6 +19,7 @@ from orchestrator.learning.requests import Failed, Pour, Poured, Slots
 from orchestrator.materials.vessel_account import VesselAccount
 from orchestrator.records.codec import decode_request, decode_result, encode_request, encode_result
 from orchestrator.records.events import CampaignOpened, RequestFinished, RequestStarted
+from orchestrator.reports.wording import _dose_table
 from orchestrator.runs.stages import CALIBRATION, DOSES, SOURCES, dispense_stages
 from sim_engine.action import Action
 from sim_engine.liquids import Liquid, SimulationParameters
@@ -79,6 +81,18 @@ def test_a_spilled_mass_that_nobody_weighed_is_unknown_and_not_zero() -> None:
         pour = asked(strategy)
         strategy.tell(pour, poured(pour, 1e3 * (pour.dose.amount if pour.dose else 0.0), **spilled))
     assert [dose.spilled_g for dose in strategy.result().doses] == [None, 0.0]
+
+
+def test_a_stream_that_misses_is_stated_with_its_missing_mass_wherever_the_dose_is_told() -> None:
+    strategy = Dispense(plan(50), seed=5)
+    pour = asked(strategy)
+    end = "stream misses the receiver"
+    strategy.tell(pour, poured(pour, 2.1, end=end, missing=7.8e-3, deviation=1e-4, spilled=None))
+    (dose,) = strategy.result().doses
+    assert (dose.missing_g, dose.end_text) == (pytest.approx(7.8), f"{end}: about 8 g of it")
+    assert dose.end_text in dose_text(dose)
+    (row,) = _dose_table("doses", strategy.result()).rows
+    assert dose.end_text in row.cells[-1]
 
 
 def test_a_dose_knows_what_the_earlier_ones_have_shown_and_left() -> None:
