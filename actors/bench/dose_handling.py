@@ -137,12 +137,12 @@ def check_vessels(
     pan = [place for place in places if place.use == "balance" and "receiver" in place.holds]
     if len(pan) != 1:
         raise InvalidActionError("doses need one place with 'use: balance' that holds a receiver")
-    known, homes, problems = {place.name: place for place in places}, dict[str, str](), dict[str, str]()
+    by_name, homes, problems = {place.name: place for place in places}, dict[str, str](), dict[str, str]()
     for vessel in vessels:
         role: Role = "pourer" if vessel.liquid else "receiver"
-        place, text = known.get(vessel.place), ""
+        place, text = by_name.get(vessel.place), ""
         if place is None:
-            text = f"there is no place '{vessel.place}' for a vessel; there are {', '.join(sorted(known))}"
+            text = f"there is no place '{vessel.place}' for a vessel; there are {', '.join(sorted(by_name))}"
         elif role not in place.holds or place.use == "balance":
             text = f"place '{place.name}' is not for a {role}: see its 'use' and 'holds'"
         elif vessel.place in homes:
@@ -278,17 +278,17 @@ class DoseHandling:
         """
         vessels = self._given or vessels_of(self._places, scene, dose)
         carrier, source_name = self._carrier, self.names(scene, dose)[0]
-        known = {vessel.name: vessel for vessel in vessels}
+        by_name = {vessel.name: vessel for vessel in vessels}
         for name, cup in zip(self.names(scene, dose), (False, True), strict=True):
-            if name not in known or cup != (not known[name].liquid):
+            if name not in by_name or cup != (not by_name[name].liquid):
                 kind = "cup" if cup else "source"
-                raise InvalidActionError(f"'{name}' is no {kind} of this series; it has {', '.join(sorted(known))}")
+                raise InvalidActionError(f"'{name}' is no {kind} of this series; it has {', '.join(sorted(by_name))}")
         if self._checked != (spec, vessels):
             self._at_places, self._loads, self._ways = check_vessels(self._places, vessels, spec, carrier.held.spec)
             if {v.name: (v.spec, v.place) for v in vessels} != {n: (v.spec, v.place) for n, v in self._vessels.items()}:
                 self.forget()  # the operator brings other vessels
                 self._laid_out = False
-            self._checked, self._vessels = (spec, vessels), known
+            self._checked, self._vessels = (spec, vessels), by_name
         carrier.spec, carrier.loads, carrier.ways = spec, self._loads, self._ways
         shapes = shapes_of(self._places, self._loads)
         cup_vessel = self._vessels[self.names(scene, dose)[1]]

@@ -133,12 +133,7 @@ def control_chart(
         if len(history) < FEWEST:
             history.append((point, squares))
             continue
-        mean, deviation = _expected(history, point.pours, resolution)
-        # Beyond 37, Student's distribution is exactly 0 or 1 in floating-point numbers.
-        z = _normal((point.value - mean) / max(deviation, 1e-300), len(history) - 1)
-        half = _student(LIMIT, len(history) - 1) * deviation
-        point.deviations, point.low, point.high = z, mean - half, mean + half
-        point.value_deviations = [z + LIMIT * (value - point.value) / max(half, 1e-300) for value in point.values]
+        z = _compare(point, history, resolution)
         recent.append(z)
         before = tuple(sums)
         for side, sign in enumerate((1, -1)):
@@ -160,6 +155,17 @@ def control_chart(
         distances = [point.deviations for point in points[begun:ended] if point.deviations is not None]
         violation.deviations = float(np.mean(distances))
     return points, [violation for violation, _, _ in periods]
+
+
+def _compare(point: ChartPoint, history: Sequence[tuple[ChartPoint, float]], resolution: float) -> float:
+    """Set the limits of a day and the distances of its values from its history. Returns that of the day."""
+    mean, deviation = _expected(history, point.pours, resolution)
+    # Beyond 37, Student's distribution is exactly 0 or 1 in floating-point numbers.
+    z = _normal((point.value - mean) / max(deviation, 1e-300), len(history) - 1)
+    half = _student(LIMIT, len(history) - 1) * deviation
+    point.deviations, point.low, point.high = z, mean - half, mean + half
+    point.value_deviations = [z + LIMIT * (value - point.value) / max(half, 1e-300) for value in point.values]
+    return z
 
 
 def _expected(history: Sequence[tuple[ChartPoint, float]], pours: int, resolution: float) -> tuple[float, float]:

@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -26,6 +26,7 @@ from orchestrator.cli.console import FAILED, RefusalError, Refused, print_messag
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm
     from actors.arm.arm_settings import ArmDiagnostics, ArmSettings, SafetyRecord
+    from actors.arm_geometry import Pose
     from actors.interfaces import DeviceCheck
     from actors.laboratory_settings import LaboratorySettings
     from actors.places import PlaceSettings, RackSettings
@@ -264,9 +265,8 @@ def teach(
     """
     from pydantic import ValidationError
 
-    from actors.arm.arm_settings import arm_kind
     from actors.laboratory import reached
-    from actors.places import PlaceSettings, all_places, rack_problem, rows_behind_others
+    from actors.places import PlaceSettings
     from orchestrator.campaigns.place_writing import LEAST_APPROACH, first_problem, write_place
     from orchestrator.cli.motion_control import connected
     from orchestrator.runs.motion_approval import accepted_checksum
@@ -287,29 +287,44 @@ def teach(
     with reached(spec) as ready, connected(ready, accepted) as (driver, facts):
         pose = driver.where().tool
         arm = (ready.arm or spec.arm).fitted_to(facts)
-    taught = {"pose": pose, "tool": tool, **({} if use is None else {"use": use})}
     if grid is not None and position != "A1":
         if before is None or before.tool != tool:
             raise RefusalError(f"teach A1 of '{name}' first, with the present tool of the arm")
         corner = "last_row" if grid.corners[str(position)][0] else "last_column"
-        taught = {"rack": grid.with_values(**{corner: pose})}
-    elif grid is not None:
-        taught |= {"rack": grid.with_values(last_row=None, last_column=None)}
-    place = before.with_values(**taught) if before is not None else PlaceSettings(name=name, **{**fresh, **taught})
-    others = all_places([other for other in spec.places if other.name != name])
-    problems = [] if place.rack is None else [text for text in [rack_problem(place)] if text]
-    if not problems:
-        place_problems = arm_kind(arm).place_problems([*others, *place.each], {})
-        problems = [text for number, text in place_problems if number >= len(others)]
-    if problems:
+        place = before.with_values(rack=grid.with_values(**{corner: pose}))
+    else:
+        taught: dict[str, Any] = {"pose": pose, "tool": tool, **({} if use is None else {"use": use})}
+        if grid is not None:
+            taught["rack"] = grid.with_values(last_row=None, last_column=None)
+        place = PlaceSettings(name=name, **{**fresh, **taught}) if before is None else before.with_values(**taught)
+    if problems := _place_problems(place, spec, arm):
         raise RefusalError("nothing is written: " + "; ".join(problems))
     with Refused(OSError):
         write_place(laboratory, place)
+    _print_taught(laboratory, place, position, pose)
+
+
+def _place_problems(place: PlaceSettings, spec: LaboratorySettings, arm: ArmSettings) -> list[str]:
+    """Why an arm can't use a taught place among the others of its laboratory."""
+    from actors.arm.arm_settings import arm_kind
+    from actors.places import all_places, rack_problem
+
+    if place.rack is not None and (problem := rack_problem(place)):
+        return [problem]
+    others = all_places([other for other in spec.places if other.name != place.name])
+    problems = arm_kind(arm).place_problems([*others, *place.each], {})
+    return [text for number, text in problems if number >= len(others)]
+
+
+def _print_taught(laboratory: Path, place: PlaceSettings, position: str | None, pose: Pose) -> None:
+    """Print where a place or a position of a rack is, and what is still to be taught of the rack."""
+    from actors.places import rows_behind_others
+
     x, y, z = (1e3 * value for value in pose.as_list[:3])
     if place.rack is None:
-        print_message(f"{laboratory}: place '{name}' is at x {x:.1f}, y {y:.1f}, z {z:.1f} mm ({place.use})")
+        print_message(f"{laboratory}: place '{place.name}' is at x {x:.1f}, y {y:.1f}, z {z:.1f} mm ({place.use})")
         return
-    print_message(f"{laboratory}: '{name}/{position}' is at x {x:.1f}, y {y:.1f}, z {z:.1f} mm")
+    print_message(f"{laboratory}: '{place.name}/{position}' is at x {x:.1f}, y {y:.1f}, z {z:.1f} mm")
     if text := rows_behind_others(place):
         print_note(text)
     corners = zip([*place.rack.corners][1:], place.rack.taught_corners, strict=True)

@@ -29,6 +29,7 @@ from orchestrator.cli.console import (
 )
 
 if TYPE_CHECKING:
+    from orchestrator.cli.command_results import SimulateOutput
     from orchestrator.learning.campaign_plan import CampaignPlan
     from sim_engine.action import Action
     from sim_engine.liquids import SimulationParameters
@@ -66,7 +67,6 @@ def simulate(
     """
     from orchestrator.campaigns.file_loading import load_discrepancy, load_parameters, load_vessel
     from orchestrator.cli.foreground_run import read_campaign, read_draws
-    from sim_engine.prediction_band import band_of, spreads
     from sim_engine.simulator import InvalidSceneError, PourSimulator
 
     plan = read_campaign(campaign)
@@ -90,38 +90,57 @@ def simulate(
     runs = _simulated_pour(simulator, tasks)
     outcomes = [run.outcome for run in runs]
     _show(tasks[0], runs[0], rrd, png)
-    over_seeds, where = spreads(outcomes), band_of(outcomes, inputs.residual)
-    received = over_seeds.get("received")
-    delivered = None if received is None else received.mean * scene.liquid.mass
     if as_json:
-        from orchestrator.cli.command_results import PredictionOutput, SimulateOutput
-
-        print_json(
-            SimulateOutput(
-                **outcomes[0].as_json(),
-                action=action.values(),
-                theta=inputs.theta,
-                thetas=len(inputs.drawn),
-                scene=scene.name,
-                delivered_g=None if delivered is None else 1e3 * delivered,
-                delivered_ml=None if delivered is None else scene.liquid.millilitres(delivered),
-                prediction=PredictionOutput.model_validate(
-                    {"band": where, "seeds": [task.seed for task in tasks], **over_seeds}
-                ),
-                regimes=None if regime is None else regime.as_json(),
-                not_covered=[] if regime is None else [gap.as_json() for gap in regime.not_covered],
-            )
-        )
+        print_json(_output(tasks, outcomes, inputs, regime))
     else:
         print_note(f"{scene.name}: {action.display()}")
-        amount = "" if delivered is None else f"{1e3 * delivered:.1f} g, {scene.liquid.millilitres(delivered):.1f} mL"
-        print(told(outcomes, over_seeds, amount))
-        if where is not None:
-            spilled = over_seeds["spillage"].percent()
-            print(f"spilled / poured {spilled}, a pour: {where.percent()}   ({inputs.said(scene)})")
+        _print_prediction(scene, outcomes, inputs)
     bad = [f"seed {o.seed}: this outcome must not be used: {o.invalid}" for o in outcomes if o.invalid is not None]
     if bad:
         raise RefusalError("\n".join(bad), FAILED)
+
+
+def _delivered(scene: Scene, over_seeds: Mapping[str, SampleStatistics]) -> float | None:
+    """Mean mass in the receiver [kg]; None if it is undefined."""
+    received = over_seeds.get("received")
+    return None if received is None else received.mean * scene.liquid.mass
+
+
+def _output(
+    tasks: list[PourTask], outcomes: list[PourOutcome], inputs: PredictionInputs, regime: ModelValidity | None
+) -> SimulateOutput:
+    """The output of --json."""
+    from orchestrator.cli.command_results import PredictionOutput, SimulateOutput
+    from sim_engine.prediction_band import band_of, spreads
+
+    scene, over_seeds = tasks[0].scene, spreads(outcomes)
+    delivered = _delivered(scene, over_seeds)
+    prediction = {"band": band_of(outcomes, inputs.residual), "seeds": [task.seed for task in tasks], **over_seeds}
+    return SimulateOutput(
+        **outcomes[0].as_json(),
+        action=tasks[0].action.values(),
+        theta=inputs.theta,
+        thetas=len(inputs.drawn),
+        scene=scene.name,
+        delivered_g=None if delivered is None else 1e3 * delivered,
+        delivered_ml=None if delivered is None else scene.liquid.millilitres(delivered),
+        prediction=PredictionOutput.model_validate(prediction),
+        regimes=None if regime is None else regime.as_json(),
+        not_covered=[] if regime is None else [gap.as_json() for gap in regime.not_covered],
+    )
+
+
+def _print_prediction(scene: Scene, outcomes: list[PourOutcome], inputs: PredictionInputs) -> None:
+    """Print the fate of the liquid, and the interval that should contain nine pours in ten."""
+    from sim_engine.prediction_band import band_of, spreads
+
+    over_seeds = spreads(outcomes)
+    delivered = _delivered(scene, over_seeds)
+    amount = "" if delivered is None else f"{1e3 * delivered:.1f} g, {scene.liquid.millilitres(delivered):.1f} mL"
+    print(told(outcomes, over_seeds, amount))
+    if (interval := band_of(outcomes, inputs.residual)) is not None:
+        spilled = over_seeds["spillage"].percent()
+        print(f"spilled / poured {spilled}, a pour: {interval.percent()}   ({inputs.said(scene)})")
 
 
 def _warn_of_arm(plan: CampaignPlan, scene: Scene, action: Action) -> None:

@@ -653,11 +653,11 @@ class LaboratoryPlaces:
     def composition(self, vessel: str) -> dict[str, tuple[float | None, float]]:
         """See `PlaceRecord.composition`."""
         with _writable():
-            found = {c.liquid: (c.mass, c.deviation) for c in self._account.composition(self._prefix + vessel)}
+            components = {c.liquid: (c.mass, c.deviation) for c in self._account.composition(self._prefix + vessel)}
             entered = self._account.content(self._prefix + vessel)
-        if entered is not None and entered.by and entered.liquid and not any(found):  # a person has poured it
-            found[entered.liquid] = entered.mass, entered.deviation
-        return found
+        if entered is not None and entered.by and entered.liquid and not any(components):  # a person has poured it
+            components[entered.liquid] = entered.mass, entered.deviation
+        return components
 
     def add_component(self, vessel: str, liquid: str, mass: float | None, deviation: float, source: str = "") -> None:
         """See `PlaceRecord.add_component`."""

@@ -64,20 +64,8 @@ def first_day(
     from orchestrator.recordings.rig_diagnosis import diagnose
     from sim_engine.errors import DecantError
     from sim_engine.liquids import SimulationParameters
-    from sim_engine.settings.quantity import QuantityError, typed_quantity
 
-    if practise and campaign is not None:
-        raise RefusalError("--practise: has a bench of its own; leave out --campaign")
-    if wrong is not None and not practise:
-        raise RefusalError("--wrong: goes with --practise; a real rig is as it is")
-    with Refused(QuantityError, at="--lag: "):
-        expected = typed_quantity(lag, "s", "0.35 s")
-    if not 0.0 < expected <= 10.0:
-        raise RefusalError(f"--lag: {lag}: should be above 0 and at most 10 s")
-    if folder.exists() and not folder.is_dir():
-        raise RefusalError(f"{folder}: is a file; name a folder for the recordings")
-    if practise and folder.is_dir() and any(folder.iterdir()):
-        raise RefusalError(f"{folder}: is not empty; name a new folder")
+    expected = _expected_lag(folder, campaign, lag, wrong, practise=practise)
     if practise or campaign is not None:
         with Refused(OSError):
             folder.mkdir(parents=True, exist_ok=True)
@@ -102,6 +90,29 @@ def first_day(
         (folder / RESULT).write_text(json.dumps(document, indent=2, default=str) + "\n", encoding="utf-8")
         (folder / PAGE).write_text(_page(folder, diagnosis, replays, words), encoding="utf-8")
     print_message(f"page: {folder / PAGE}")
+
+
+def _expected_lag(folder: Path, campaign: Path | None, lag: str, wrong: str | None, *, practise: bool) -> float:
+    """The expected lag of the balance [s], once the options fit together.
+
+    Raises:
+        RefusalError: they don't, or the folder can't have the recordings (exit code 2).
+    """
+    from sim_engine.settings.quantity import QuantityError, typed_quantity
+
+    if practise and campaign is not None:
+        raise RefusalError("--practise: has a bench of its own; leave out --campaign")
+    if wrong is not None and not practise:
+        raise RefusalError("--wrong: goes with --practise; a real rig is as it is")
+    with Refused(QuantityError, at="--lag: "):
+        expected = typed_quantity(lag, "s", "0.35 s")
+    if not 0.0 < expected <= 10.0:
+        raise RefusalError(f"--lag: {lag}: should be above 0 and at most 10 s")
+    if folder.exists() and not folder.is_dir():
+        raise RefusalError(f"{folder}: is a file; name a folder for the recordings")
+    if practise and folder.is_dir() and any(folder.iterdir()):
+        raise RefusalError(f"{folder}: is not empty; name a new folder")
+    return expected
 
 
 def _day_of(folder: Path) -> list[PourRecording]:

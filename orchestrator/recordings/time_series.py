@@ -94,38 +94,7 @@ def read_series(path: Path, names: Mapping[str, str] | None = None) -> TimeSerie
     header = table.header
     series = TimeSeries(table, places, {})
     problems = table.misfits()
-    cells: dict[str, tuple[list[float], list[float], list[int]]] = {name: ([], [], []) for name in places}
-    before, unsorted = -math.inf, 0
-    for row in table.rows:
-        if len(problems) >= PROBLEMS_SHOWN:
-            break
-        if len(row.cells) != len(header.cells):
-            continue
-        numbers = {name: _number(table, row, place, problems, name) for name, place in places.items()}
-        time = numbers.pop("time")
-        if time is None:
-            if row.cells[places["time"]] == "":
-                problems.append(series.problem(row.line, "has no time; give every line its time", "time"))
-            continue
-        time *= factors["time"]
-        if time < before:
-            if not unsorted:
-                text = f"the time goes back, from {before:g} s to {time:g} s; sort the lines by time"
-                problems.append(series.problem(row.line, text, "time"))
-            unsorted += 1
-            continue
-        before = time
-        for name, number in numbers.items():
-            if number is not None:
-                times, values, lines = cells[name]
-                times.append(time)
-                values.append(factors[name] * number)
-                lines.append(row.line)
-    columns = {
-        name: Column(np.array(times), np.array(values), np.array(lines, dtype=np.int64))
-        for name, (times, values, lines) in cells.items()
-        if times
-    }
+    columns = _columns(series, factors, problems)
     for name, column in columns.items():
         problems += _repeated(series, name, column)
     if not problems and "mass" not in columns:
@@ -145,6 +114,43 @@ def read_series(path: Path, names: Mapping[str, str] | None = None) -> TimeSerie
         text = f"times count from 1970 ({first:.3f} s); the recording starts at 0 s"
         warnings.append(series.problem(line, text, "time"))
     return TimeSeries(table, places, columns, tuple(warnings))
+
+
+def _columns(series: TimeSeries, factors: Mapping[str, float], problems: list[Problem]) -> dict[str, Column]:
+    """The columns of a file that have a value, in SI units; lines that can't be used are added to the problems."""
+    table, places = series.table, series.places
+    cells: dict[str, tuple[list[float], list[float], list[int]]] = {name: ([], [], []) for name in places}
+    before, sorted_so_far = -math.inf, True
+    for row in table.rows:
+        if len(problems) >= PROBLEMS_SHOWN:
+            break
+        if len(row.cells) != len(table.header.cells):
+            continue
+        numbers = {name: _number(table, row, place, problems, name) for name, place in places.items()}
+        time = numbers.pop("time")
+        if time is None:
+            if row.cells[places["time"]] == "":
+                problems.append(series.problem(row.line, "has no time; give every line its time", "time"))
+            continue
+        time *= factors["time"]
+        if time < before:
+            if sorted_so_far:
+                text = f"the time goes back, from {before:g} s to {time:g} s; sort the lines by time"
+                problems.append(series.problem(row.line, text, "time"))
+            sorted_so_far = False
+            continue
+        before = time
+        for name, number in numbers.items():
+            if number is not None:
+                times, values, lines = cells[name]
+                times.append(time)
+                values.append(factors[name] * number)
+                lines.append(row.line)
+    return {
+        name: Column(np.array(times), np.array(values), np.array(lines, dtype=np.int64))
+        for name, (times, values, lines) in cells.items()
+        if times
+    }
 
 
 def _places(table: SavedTable, names: Mapping[str, str]) -> tuple[dict[str, int], dict[str, float], list[str]]:
