@@ -4,12 +4,14 @@ pours prefer.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from actors.optimizer.questions import Posterior
 from orchestrator.learning.calibration import automatic_calibration
@@ -23,13 +25,19 @@ from orchestrator.learning.calibration.calibration_scores import (
     Scores,
 )
 from orchestrator.learning.calibration.posterior_summary import posterior_change
-from orchestrator.learning.calibration.pour_residuals import ResidualPair, pour_residuals
+from orchestrator.learning.calibration.pour_residuals import (
+    ResidualPair,
+    SpillageResidual,
+    misfit_sentence,
+    pour_residuals,
+)
 from orchestrator.learning.campaign_plan import MeasuredPour
 from orchestrator.learning.requests import Failed, Outcome, Request, Simulate
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, deployed_theta, with_posterior
 from orchestrator.runs.strategy_harness import CALIBRATION_ACTIONS, SCENE, StrategyHarness, replay
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
+from sim_engine.prediction_band import resolution_shift
 from tests.support.plans import calibration_plan, deployment_plan
 from tests.support.toy_spillage import TRUE_THETA, calibration_spill
 
@@ -198,6 +206,35 @@ def test_swapped_weights_are_named_with_their_intervals_and_theta_without_them()
     assert bad.gain is not None
     assert f"pour {low + 1} (line {low + 2}) weighed {100 * spilled[high]:.1f} %" in bad.gain.text
     assert "without them θ* would be" in bad.gain.text
+
+
+def compared(weighed: Sequence[float], simulated: Sequence[float]) -> tuple[SpillageResidual, ...]:
+    """Residuals of training pours that were simulated with 400 particles."""
+    action = SCENE.action(CALIBRATION_ACTIONS.decode([0.5, 0.5]))
+    pairs = zip(weighed, simulated, strict=True)
+    return pour_residuals([ResidualPair(MeasuredPour(action, r, 0.9, "train"), SCENE.name, c) for r, c in pairs], 400)
+
+
+def test_two_exchanged_weights_are_named_as_a_pair_though_each_lies_in_its_interval() -> None:
+    """0 and 16 % of one calibration. Its θ* lies between the two, so that the residuals of the others are larger."""
+    spilled = [0.23, 0.04, 0.0, 0.007, 0.01, 0.062, 0.11, 0.33, 0.04, 0.052, 0.045, 0.16]
+    simulated = [0.13, 0.09, 0.01, 0.03, 0.03, 0.12, 0.05, 0.19, 0.09, 0.02, 0.09, 0.11]
+    assert all(pour.fits for pour in compared(spilled, simulated))
+    spilled[2], spilled[11] = spilled[11], spilled[2]
+    pours = compared(spilled, simulated)
+    assert {pour.number: pour.exchanged_with for pour in pours if not pour.fits} == {3: 12, 12: 3}
+    assert all(pour.low <= pour.measured <= pour.high for pour in pours)  # type: ignore[operator]
+    assert "the weights of pour 3 and pour 12 seem to be exchanged" in misfit_sentence(pours, None)
+
+
+def test_weights_that_scatter_are_not_called_exchanged() -> None:
+    rng, tables = np.random.default_rng(4), 200
+    named = 0
+    for _ in range(tables):
+        places = rng.uniform(-2.5, 0.0, 12)
+        weighed = places + rng.normal(0.0, resolution_shift(400), 12)
+        named += any(pour.exchanged_with for pour in compared(norm.cdf(weighed), norm.cdf(places)))
+    assert named <= 6  # 1 in 100 expected
 
 
 def test_few_pours_are_not_judged_and_a_pour_does_not_hide_itself() -> None:
