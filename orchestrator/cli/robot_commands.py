@@ -288,10 +288,7 @@ def teach(
         pose = driver.where().tool
         arm = (ready.arm or spec.arm).fitted_to(facts)
     if grid is not None and position != "A1":
-        if before is None or before.tool != tool:
-            raise RefusalError(f"teach A1 of '{name}' first, with the present tool of the arm")
-        corner = "last_row" if grid.corners[str(position)][0] else "last_column"
-        place = before.with_values(rack=grid.with_values(**{corner: pose}))
+        place = _taught_corner(before, name, grid, str(position), pose, tool)
     else:
         taught: dict[str, Any] = {"pose": pose, "tool": tool, **({} if use is None else {"use": use})}
         if grid is not None:
@@ -302,6 +299,16 @@ def teach(
     with Refused(OSError):
         write_place(laboratory, place)
     _print_taught(laboratory, place, position, pose)
+
+
+def _taught_corner(
+    before: PlaceSettings | None, name: str, grid: RackSettings, position: str, pose: Pose, tool: Pose
+) -> PlaceSettings:
+    """A rack with the pose of another corner than A1, which is taught first."""
+    if before is None or before.tool != tool:
+        raise RefusalError(f"teach A1 of '{name}' first, with the present tool of the arm")
+    corner = "last_row" if grid.corners[position][0] else "last_column"
+    return before.with_values(rack=grid.with_values(**{corner: pose}))
 
 
 def _place_problems(place: PlaceSettings, spec: LaboratorySettings, arm: ArmSettings) -> list[str]:
