@@ -236,7 +236,7 @@ def actions() -> str:
     """What an action consists of."""
     rows = []
     for name, d in ACTION_DIMENSIONS.items():
-        default: Any = DEFAULTS[name]
+        default: Any = DEFAULTS.get(name)
         if name in NEEDED:
             given = "none: fix it or search it"
         elif default is None:
