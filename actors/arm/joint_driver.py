@@ -72,6 +72,9 @@ LATEST = 0.02
 GAIN = 8.0
 """Speed that corrects a joint per distance from its path [1/s]."""
 
+LARGEST_DRIFT = 0.05
+"""Largest speed of a joint that is added in a dose because the robot drifts at rest [rad/s]."""
+
 HOLD = 0.15
 """Time for which a robot keeps a commanded speed without a newer command [s]."""
 
@@ -570,6 +573,7 @@ class VelocityArm(JointArm):
         first, last = float(dose.tilts[0]), float(dose.tilts[-1])
         track = JointPath(dose.tilts - first, dose.joints)
         tilt, speed, before, late = first, 0.0, 0.0, False
+        drift = np.zeros(len(self._fastest))  # a dose creeps from the measured tilt on: a lasting error would stop it
         dose.until = self._last_time + 1.0  # the first command may take a while
         for reading in self._readings(times, joints):
             span, before = reading.time - before, reading.time
@@ -590,7 +594,9 @@ class VelocityArm(JointArm):
             speed = min(max(wanted, speed - step), speed + step)
             tilt = min(max(tilt + speed * min(span, LATEST), first), last)
             here, per_tilt = dose.at(tilt)
-            speeds = np.clip(per_tilt * speed + GAIN * (here - reading.joints), -self._fastest, self._fastest)
+            error = here - reading.joints
+            drift = np.clip(drift + (0.5 * GAIN) ** 2 * min(span, LATEST) * error, -LARGEST_DRIFT, LARGEST_DRIFT)
+            speeds = np.clip(per_tilt * speed + GAIN * error + drift, -self._fastest, self._fastest)
             # the robot itself stops at the largest tilt, however late the next command is
             left = max((last if back else dose.highest) - tilt, 0.0)
             self._robot.turn(speeds, min(HOLD, left / speed) if speed > 0.0 else HOLD)

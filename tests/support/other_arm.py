@@ -69,6 +69,7 @@ class SpeedRobot:
     Attributes:
         plugged: the robot can be reached.
         tripped: a protective stop is in force.
+        drift: speeds that are added to those of a command (n,) [rad/s].
         stretch: longest time that passes between two measurements [s]: on a busy machine its clock slows down.
     """
 
@@ -80,6 +81,7 @@ class SpeedRobot:
         self._now = self._until = 0.0
         self._seen, self.stretch = time.monotonic(), 0.02
         self.plugged, self.tripped = True, False
+        self.drift = np.zeros(len(joints))
         self.readings: list[tuple[float, FloatArray]] = []
 
     def measure(self) -> tuple[float, FloatArray]:
@@ -92,7 +94,8 @@ class SpeedRobot:
                 stands = self.tripped or not self.plugged or self._now >= self._until
                 change = (np.zeros(6) if stands else self._wanted) - self._speeds
                 self._speeds = self._speeds + np.clip(change, -self.ACCELERATION * step, self.ACCELERATION * step)
-                self._joints, self._now = self._joints + self._speeds * step, self._now + step
+                moved = self._speeds if stands else self._speeds + self.drift
+                self._joints, self._now = self._joints + moved * step, self._now + step
             self.readings.append((now, self._joints))
             return self.readings[-1]
 

@@ -40,7 +40,7 @@ LATE = 10
 """Cycles by which the client's commands may be late before the robot waits for them."""
 
 HANGS = 2.0
-"""Time after which it no longer waits: its client hangs [s]."""
+"""Time of waiting after which its client hangs, and a reflex stops it [s]."""
 
 EVERY = 8
 """Cycles between two samples of the history."""
@@ -49,8 +49,8 @@ CREEP = 2e-4
 """Changes of the joints that do not count [rad]: a standing robot of franky-sim sags by a little more."""
 
 SILENCE = 0.2
-"""Wall time after which a moving robot makes a cycle although the clock of the bench stands [s]: libfranka counts a
-second of silence as a lost connection."""
+"""Wall time after which a moving robot makes a cycle although the clock of the bench stands, or its client is late [s]:
+libfranka counts a second of silence as a lost connection."""
 
 KEPT = 120.0
 """Time for which samples are kept [s]."""
@@ -126,7 +126,8 @@ class VirtualFranka:
         self._ports = Ports(self._robot, [address])
         self._ports.init()
         simulator.start()
-        self._samples: deque[tuple[float, list[float]]] = deque(maxlen=round(KEPT / (EVERY * TICK)))
+        self._samples: deque[tuple[float, list[float], str]] = deque(maxlen=round(KEPT / (EVERY * TICK)))
+        self._waited = 0.0
         self._cycles = 0
         self._orders: deque[str] = deque()
         self._ended = threading.Event()
@@ -166,12 +167,13 @@ class VirtualFranka:
             self._robot.joint_position_control(self._held)
         else:
             ports.process_commands()
-            hangs = time.monotonic() + HANGS
-            while ports.late and time.monotonic() < hangs:
+            waits = time.monotonic() + SILENCE
+            while (late := ports.late) and time.monotonic() < waits:
                 self._clock.advance(0.0)
                 time.sleep(2e-4)
                 ports.process_commands()
-            if ports.late:
+            self._waited = self._waited + SILENCE if late else 0.0
+            if self._waited >= HANGS:
                 ports.trip()
         self._simulator.step()
         ports.send_state()
@@ -180,15 +182,17 @@ class VirtualFranka:
             joints, before = list(map(float, self._robot.inner_state.q)), self._samples[-1][1] if self._samples else []
             if before and max(abs(a - b) for a, b in zip(joints, before, strict=True)) < CREEP:
                 joints = before
-            self._samples.append((self._cycles * TICK, joints))
+            self._samples.append((self._cycles * TICK, joints, json.dumps(joints)))
 
     def _answer(self) -> None:
         for line in sys.stdin:
             request = json.loads(line)
             self._scale = request.get("pace", self._scale)
             self._orders.extend(request.get("orders", []))
-            later = [(t, q) for t, q in list(self._samples) if t > request.get("since", 1e12)]
-            _say({"now": self._cycles * TICK, "times": [t for t, _ in later], "joints": [q for _, q in later]})
+            later = [(t, text) for t, _, text in list(self._samples) if t > request.get("since", 1e12)]
+            # The joints are encoded one by one: no thread could send states while a long text is encoded at once.
+            joints, times = ", ".join(text for _, text in later), ", ".join(repr(t) for t, _ in later)
+            _say(f'{{"now": {self._cycles * TICK!r}, "times": [{times}], "joints": [{joints}]}}')
         self._ended.set()
 
 
@@ -204,12 +208,12 @@ def main() -> None:
     with contextlib.redirect_stdout(sys.stderr), MujocoSimulator() as simulator:
         simulator.add_robot(initial_q=joints)
         robot = VirtualFranka(simulator, chosen.address, SharedClock(chosen.clock), chosen.time_scale)
-        _say({"ready": chosen.address})
+        _say(json.dumps({"ready": chosen.address}))
         robot.run()
 
 
-def _say(answer: dict[str, Any]) -> None:
-    sys.__stdout__.write(json.dumps(answer) + "\n")  # type: ignore[union-attr]
+def _say(answer: str) -> None:
+    sys.__stdout__.write(answer + "\n")  # type: ignore[union-attr]
     sys.__stdout__.flush()  # type: ignore[union-attr]
 
 

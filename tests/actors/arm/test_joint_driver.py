@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError
 from actors.arm.joint_driver import VelocityArm
 from actors.contract_tests.arm_contract import ArmBench, ArmContract
+from actors.contract_tests.contract_calls import Call
 from sim_engine.action import DEG
 from sim_engine.liquids import Liquid
 from sim_engine.scene import Scene
 from tests.support.other_arm import OtherArmKind, OtherRobot, SpeedRobot, other_arm
 from tests.support.planning_cell import ACTION, vessel
+from tests.support.waiting import wait_for
 
 pytestmark = pytest.mark.realtime
 
@@ -82,6 +84,18 @@ def test_the_executed_tilt_is_the_planned_one(speed: float, arm: VelocityArm) ->
     lags = np.linspace(-0.02, 0.02, 41)
     errors = [np.abs(path.pour.at(executed.times - lag) - executed.joints).max() for lag in lags]
     assert min(errors) < (0.3 + 2e-3 * speed) * DEG  # a command holds for 10 ms, so that ramps are up to 2 ms off
+
+
+def test_a_robot_that_drifts_creeps_on_in_a_dose(arm: VelocityArm, path) -> None:
+    """Each command of a dose goes a little farther than the measured tilt."""
+    tilts, joints = path.tilt_part
+    arm.release()
+    arm.move_to_start(path)
+    arm.robot.cable.drift = -0.8 * DEG * (joints[1] - joints[0]) / (tilts[1] - tilts[0])  # type: ignore[attr-defined]
+    dosing = Call(arm.dose, path, 100.0)
+    wait_for(lambda: arm.state().moving, "it does not begin")
+    wait_for(lambda: arm.drive(1.0 * DEG, arm.state().tilt + 0.05 * DEG, 1.0).tilt > 2.0 * DEG, "it stands still")
+    assert dosing.ended() is None
 
 
 def test_an_arm_that_was_moved_by_other_means_is_not_moved_blindly(arm: VelocityArm, path) -> None:

@@ -73,6 +73,32 @@ def test_a_laboratory_that_no_franka_fits_has_one_error(
     assert str(error.value).count("laboratory.yaml:") == 1
 
 
+POSE = "rx: 2.22144 rad, rz: 2.22144 rad}, tool: {z: 103.4 mm, rz: -45 deg}"
+CARRIES = [
+    (r"home: .*", "home: [-67.46 deg, 20.17 deg, 34.63 deg, -123.91 deg, -44.38 deg, 232.59 deg, 62.11 deg]"),
+    (r"y: -650 mm, z: 0 mm}, high: {.*}}", "y: -700 mm, z: 0 mm}, high: {x: 800 mm, y: 400 mm, z: 1 m}}"),
+    ("z: 100 mm}  #", "z: 250 mm}  #"),
+    ("placement: tray", "placement: receiver"),
+    (
+        "balance:",
+        "gripper: {kind: onrobot, model: RG6}\nplaces:\n"
+        f"- {{name: pan, use: balance, pose: {{x: 600 mm, z: 310 mm, {POSE}}}\n"
+        f"- {{name: source, holds: [pourer], pose: {{x: 420 mm, y: -520 mm, z: 310 mm, {POSE}}}\n"
+        f"- {{name: rack, holds: [receiver], clearance: 8 mm, pose: {{x: 550 mm, y: -320 mm, z: 310 mm, {POSE}, rack: "
+        "{rows: 1, columns: 2, row_pitch: 120 mm, column_pitch: 140 mm, direction: 90 deg}}\nbalance:",
+    ),
+]
+
+
+def test_it_carries_between_places_and_a_rack_and_names_the_joint_that_does_not_reach_one(tmp_path: Path) -> None:
+    pytest.importorskip("pinocchio")
+    pytest.importorskip("franky_sim")
+    laboratory = load_laboratory(changed(tmp_path, *CARRIES))
+    assert [place.name for place in laboratory.places] == ["pan", "source", "rack"]
+    with pytest.raises(DecantError, match=r"place 'source': joint 6 \(joint6\) would turn to 28\d\.\d deg"):
+        load_laboratory(changed(tmp_path, *CARRIES, ("y: -520 mm", "y: 200 mm")))
+
+
 def test_the_arm_makes_the_fastest_pour_that_is_searched(tmp_path: Path) -> None:
     """The search of a campaign ends at the arm's own limit."""
     pytest.importorskip("pinocchio")
