@@ -163,8 +163,8 @@ def number_readings(text: str) -> tuple[str, ...]:
     return tuple(filter(None, [plain_number(text, decimal_comma=kind == ",")]))
 
 
-_SMALLER = {"g": "mg", "kg": "g", "m": "mm", "s": "ms", "L": "mL"}
-"""Units of a thousandth."""
+_SMALLER = {"g": "mg", "kg": "g", "mg": "ug", "m": "mm", "s": "ms", "l": "mL"}
+"""Units of a thousandth, of units in small letters."""
 
 
 def typed_number(text: str, unit: str = "", *, largest: float = math.inf) -> Decimal:
@@ -188,9 +188,9 @@ def typed_number(text: str, unit: str = "", *, largest: float = math.inf) -> Dec
     if not possible:
         raise QuantityError(f"'{text}{unit}' is too much: at most {largest:g}{unit} is possible. Is the unit right?")
     fine, coarse = possible
-    # with a smaller unit, so that no digit is added that nobody read
-    smaller = _SMALLER.get(unit.strip())
-    whole = f"{Decimal(fine).scaleb(3):f} {smaller}" if smaller else f"{fine}0{unit}"
+    # with a smaller unit or an exponent, so that no digit is added that nobody read
+    smaller = _SMALLER.get(unit.strip().lower())
+    whole = f"{Decimal(fine).scaleb(3):f}" + (f" {smaller}" if smaller else f"e-3{unit}")
     raise QuantityError(f"'{text}{unit}' may be {fine}{unit} or {coarse}{unit}; type '{whole}' or '{coarse}{unit}'")
 
 

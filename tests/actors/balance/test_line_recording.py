@@ -343,6 +343,12 @@ def test_the_files_of_other_programs_are_explained(tmp_path, content, note):
         (b"S I\r\n" * 4, "It was busy or not at rest each time: record again when its display stands still"),
         (b"S +\r\n" * 4, "Over range: more is on it than it weighs"),
         (b"Err 54\r\n" * 3, "It reports a fault"),
+        (
+            b"+ 0000.0003\r\n+ 0012.4510\r\n",
+            "to print the weight in g with its unit",
+        ),  # Denver M: mdpnp/mdpnp, issue 19
+        (b"-00.000\r\n 00.165\r\n" * 2, "to print the weight in g with its unit"),  # Dibal, a POS scale of its manual
+        (b"\x02A   0.165\r\x03" * 3, "Its lines stand between STX and ETX"),  # qzind/tray, issue 881
         (b"+ ~~~~~~~~GN\r\n" * 3, "no dialect reads a weight"),  # eamars/OpenTrickler-RP2040-Controller, 49: overload
         (b"dear colleague,\nthe balance does not work\n", "no dialect reads a weight"),
     ],

@@ -69,6 +69,9 @@ def test_typed_weights_are_understood_as_people_type_them(text, mass, step):
         ("1,234 g", "'1,234 g' may be 1.234 g or 1234 g; type '1234 mg' or '1234 g'"),
         ("1.234 g", "'1.234 g' may be 1.234 g or 1234 g; type '1234 mg' or '1234 g'"),
         ("1,250 g", "may be 1.250 g or 1250 g"),
+        ("12.345 G", "type '12345 mg' or '12345 G'"),  # no form adds a digit that nobody read
+        ("12.345 mg", "type '12345 ug' or '12345 mg'"),
+        ("12.345 ct", "type '12345e-3 ct' or '12345 ct'"),
         ("100000 kg", "'100000 kg' is too much: at most 20 kg is possible"),
     ],
 )
