@@ -22,7 +22,7 @@ MARKED = re.compile(
 )
 FIGURES = {
     "benches": ("study", ("3b", "6")),
-    "paper": ("paper-study", ("4", "6")),
+    "paper": ("paper-study", ("6",)),
 }
 """Folder of the images, and the figures that the pages show, by the name of the study."""
 

@@ -127,7 +127,7 @@ def test_a_number_is_read_as_it_was_meant_or_refused_in_every_country(
     try:
         readings = [typed_number(text)]
     except QuantityError as error:
-        readings = [Decimal(reading) for reading in re.findall(r"'([0-9.]+)'", str(error).partition("; type ")[2])]
+        readings = [Decimal(reading) for reading in re.findall(r"'([0-9.e-]+)'", str(error).partition("; type ")[2])]
     assert meant in readings
 
 
