@@ -76,9 +76,17 @@ FINE_WEBER = 0.8
 """Weber number of the film at the lip in the fine flow at the end. Below `DRIBBLING_WEBER` a part may dribble, but only
 for a second or two; a faster flow would add more to the error than it saves in spilled liquid."""
 
+FINE_TIME = 2.5
+"""Shortest time in which the fine flow pours a whole dose [s]: a small one ends before a faster flow is known."""
+
 
 def fine_flow(
-    cup: CupFlow, tilt: float, settings: DosingSettings, limit: float = math.inf, interval: float = 0.0
+    cup: CupFlow,
+    tilt: float,
+    settings: DosingSettings,
+    limit: float = math.inf,
+    interval: float = 0.0,
+    amount: float = math.inf,
 ) -> float:
     """Flow at the end of a dose: slow, but fast enough to leave the lip [kg/s].
 
@@ -88,11 +96,12 @@ def fine_flow(
         settings: lower and upper bound.
         limit: tolerance of the dose [kg]; a slow balance needs a slower flow.
         interval: between two readings [s].
+        amount: of the dose [kg].
     """
-    # min(ρ q at We = FINE_WEBER, flow at which `unseen` equals the tolerance), within the settings
+    # min(ρ q at We = FINE_WEBER, flow at which `unseen` equals the tolerance, amount / FINE_TIME), within the settings
     clean = cup.clean_flow(tilt, FINE_WEBER) * cup.density
     seen = limit / unseen(1.0, interval) if interval > 0.0 else math.inf
-    return min(max(min(clean, seen), settings.smallest_flow), settings.largest_fine_flow)
+    return min(max(min(clean, seen, amount / FINE_TIME), settings.smallest_flow), settings.largest_fine_flow)
 
 
 def unseen(flow: float, interval: float) -> float:
@@ -475,7 +484,7 @@ class DoseController:
             self._enter(DosePhase.POUR)
             return self._pour()
         order, interval = self._order, self._readings.interval
-        self.fine_flow = fine_flow(self._cup, max(early, 0.1), self._settings, order.limit, interval)
+        self.fine_flow = fine_flow(self._cup, max(early, 0.1), self._settings, order.limit, interval, order.amount)
         if self._must_stop():
             return self._return()
         if ahead < early:

@@ -195,7 +195,7 @@ class DoseSeries:
             ends[result.end] += 1
         # Quantiles 5 and 95 % of the simulated amounts; the weighing adds its own error, ±1.645 σ, in `reachable`.
         tilt = float(np.median(self._cup.tilt_for(widened.volume, np.zeros_like(widened.volume))))
-        fine = fine_flow(self._cup, max(tilt, 0.1), self._settings, order.limit, widened.display.interval)
+        fine = fine_flow(self._cup, max(tilt, 0.1), self._settings, order.limit, widened.display.interval, order.amount)
         low, high = (float(np.quantile(amounts, q)) for q in (0.05, 0.95))
         return DoseForecast(
             float(np.mean(amounts)),

@@ -250,13 +250,15 @@ class Unheard:
         return self._controller.step(time, tilt, readings)
 
 
-def known_display(interval: float, lost: float = 0.0) -> tuple[VirtualDosingBench, DoseController]:
-    """A dose of 100 g onto a balance whose readings were seen when the receiver was put on it."""
+def known_display(
+    interval: float, lost: float = 0.0, *, amount: float = 0.1
+) -> tuple[VirtualDosingBench, DoseController]:
+    """A dose of 100 g, or another amount, onto a balance whose readings were seen when the receiver was put on it."""
     scale = TrueScale(lag=0.3, interval=interval, behaviour=DisplayBehaviour(lost=lost))
     bench, rng = VirtualDosingBench(SPOUTED, WATER, scale, 1), np.random.default_rng(1)
     content = SourceContent(WATER.mass)
     series = DoseSeries(CUP, DosingSettings(), content, bench.place_receiver(), rng, particles=80)
-    return bench, series.controller(DoseOrder(0.1, receiver_mass=bench.receiver_mass), seed=1)
+    return bench, series.controller(DoseOrder(amount, receiver_mass=bench.receiver_mass), seed=1)
 
 
 @pytest.mark.parametrize(("interval", "lost"), [(1.0, 0.0), (0.5, 0.1)])
@@ -327,6 +329,15 @@ def test_a_balance_that_is_too_slow_for_a_tolerance_is_refused_with_the_one_that
 def test_a_slow_balance_gets_a_slower_flow_at_the_end() -> None:
     flows = [fine_flow(CUP, 1.0, DosingSettings(), 1e-3, interval) for interval in (0.1, 1.0, 5.0)]
     assert flows == pytest.approx([8e-3, 5.8e-3, 4e-3], rel=0.02)
+
+
+def test_a_small_dose_is_poured_more_slowly() -> None:
+    flows = []
+    for amount in (0.05, 0.0125, 5e-3):
+        bench, controller = known_display(0.1, amount=amount)
+        bench.dose(controller)
+        flows.append(controller.fine_flow)
+    assert flows == pytest.approx([8e-3, 5e-3, 4e-3], rel=0.02)
 
 
 def test_a_balance_that_sends_seldom_and_is_lost_ends_the_dose_below_its_amount() -> None:
