@@ -204,10 +204,6 @@ DRIBBLES = 0.3e-3
 """Mass that arrives late in addition, where the last stream is too slow to leave the lip cleanly [kg]: about half of
 what runs down the outside. Later doses know it from the ones before."""
 
-ASTRAY = (5e-3, 0.5)
-"""Estimated mass past the lip beyond the weighed one from which the stream misses the receiver: [kg], and at least such
-a part of the estimate. After a pause the flow was known to half: prior flow factors scatter by 20 %."""
-
 LONGEST_SETTLING = (10.0, 15.0)
 """Time without rest of the balance after which the amount is unknown: [s], and at least so many readings."""
 
@@ -562,9 +558,8 @@ class DoseController:
         # within one step of the display, the particles know more than it shows
         likely = min(max(float(self._estimator.mass.mean()), amount - step), amount + step)
         missing = max(self._departed, self._latest.mass) - amount
-        astray = self._doubted and missing > max(ASTRAY[0], ASTRAY[1] * self._departed)
-        if astray or (self._suspected is not None and (self._flows_less() or self._latest.lacks(amount))):
-            self._end = self._end or self._suspected or self._lost_stream()
+        if self._suspected is not None and (self._flows_less() or self._latest.lacks(amount)):
+            self._end = self._end or self._suspected
             self._missing = max(missing, self._usual.mass - amount) if self._end is DoseEnd.STREAM_MISSED else 0.0
         smallest = max(self._settings.smallest_top_up, 1.5 * step)
         if self._end is None and self._order.amount - likely > smallest:
