@@ -74,7 +74,7 @@ oldest:
 COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --no-emit-find-links --no-header --no-annotate -q
 lock:
-	$(COMPILE) --all-extras --group build --group test -o requirements-test.lock
+	$(COMPILE) --extra all --extra quadrants --extra sila --group build --group test -o requirements-test.lock
 	$(COMPILE) -c requirements-test.lock --extra all --group build -o requirements.lock
 	$(COMPILE) -c requirements-test.lock --extra all --group build --group docs -o requirements-docs.lock
 

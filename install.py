@@ -40,12 +40,7 @@ class Need(NamedTuple):
 PROGRAM = Need("requirements.lock", "the program: simulator, optimiser, devices, daemon, recordings", 1.5, ".ready")
 NEEDS = {
     "program": PROGRAM,
-    "test": Need(
-        "requirements-test.lock",
-        "the tests: lint, types, browser, notebook, Quadrants, arms from a URDF, Franka",
-        1.2,
-        ".ready-test",
-    ),
+    "test": Need("requirements-test.lock", "the tests: lint, types, browser, notebook, Quadrants", 0.6, ".ready-test"),
     "docs": Need("requirements-docs.lock", "the site: Sphinx and its theme", 0.1, ".ready-docs"),
 }
 
