@@ -357,7 +357,7 @@ def after_dose(series: DoseSeries, result: DoseResult) -> dict[str, Any]:
         "received": result.amount,
         "deviation": result.deviation,
         "end": str(result.end),
-        "missing": result.missing,
+        "missing_mass": result.missing,
         "top_ups": result.top_ups,
         "innovations": result.innovations,
         "left": [max(content.mass - lost, 0.0), math.hypot(content.deviation, deviation)],

@@ -522,7 +522,7 @@ class Dispense:
             filled=pour.dose.source.fill,
             left_g=None if left is None else 1e3 * left.mass,
             left_deviation_g=None if left is None else 1e3 * left.deviation,
-            missing_g=1e3 * about.get("missing", 0.0),
+            missing_g=1e3 * about.get("missing_mass", 0.0),
             signals=DoseSignals(**{name: about.get(name, ()) for name in DoseSignals.model_fields}),
         )
         self._doses.append(dose)

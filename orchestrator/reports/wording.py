@@ -434,7 +434,7 @@ def _liquid(record: RunState, weighed: Sequence[PourMeasurement]) -> str:
     if spilled := sum(each.spilled_g or 0.0 for each in masses):
         text += f", {spilled:.1f} g spilled"
     unweighed = [
-        LOST[0] + measured.notes.get("dose", {}).get("missing", 0.0)
+        LOST[0] + measured.notes.get("dose", {}).get("missing_mass", 0.0)
         for each, measured in zip(masses, weighed, strict=True)
         if each.spilled_g is None and not entered_by_hand(measured)
     ]

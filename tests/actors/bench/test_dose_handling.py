@@ -149,6 +149,7 @@ def test_a_cup_gets_two_liquids_alone_and_every_gram_is_accounted(open_stage: Op
     assert record.stands() == stage.contents.stands
     for about, grams in zip(notes, (10.0, 20.0), strict=True):
         assert about["cup"] == "rack/A1"
+        assert about["missing_mass"] == 0.0  # of its stream; "missing" is what the source lacked before
         assert 1e3 * about["received"] == pytest.approx(grams, abs=4.0)  # less exact on a busy machine
         assert about["received"] == pytest.approx(about["true"], abs=5e-4)
         assert about["gross"][0] - about["tare"][0] == pytest.approx(about["received"], abs=5e-4)

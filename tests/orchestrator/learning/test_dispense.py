@@ -87,7 +87,7 @@ def test_a_stream_that_misses_is_stated_with_its_missing_mass_wherever_the_dose_
     strategy = Dispense(plan(50), seed=5)
     pour = asked(strategy)
     end = "stream misses the receiver"
-    strategy.tell(pour, poured(pour, 2.1, end=end, missing=7.8e-3, deviation=1e-4, spilled=None))
+    strategy.tell(pour, poured(pour, 2.1, end=end, missing=None, missing_mass=7.8e-3, deviation=1e-4, spilled=None))
     (dose,) = strategy.result().doses
     assert (dose.missing_g, dose.end_text) == (pytest.approx(7.8), f"{end}: about 8 g of it")
     assert dose.end_text in dose_text(dose)
