@@ -12,6 +12,7 @@ import shutil
 import signal
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -84,6 +85,8 @@ def pytest_collection() -> Iterator[None]:
 @pytest.hookimpl(trylast=True)  # after those that were not chosen have gone
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Sort and mark the tests, and leave out those of other parts. No test is tried again."""
+    if twice := [name for name, count in Counter(item.nodeid for item in items).items() if count > 1]:
+        raise pytest.UsageError(f"several tests have the name {twice[0]}, of which pytest-xdist would run one")
     rank: dict[Path, float] = {}
     for folder in MANY:
         files = list(dict.fromkeys(item.path for item in items if item.path.is_relative_to(folder)))
