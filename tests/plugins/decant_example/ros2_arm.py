@@ -42,11 +42,13 @@ class Ros2Robot:
     """See `decant.plugins.JointRobot`."""
 
     def __init__(self, spec: Ros2Settings) -> None:
-        self._spec, self._ros, self._goal = spec, None, ""
+        self._spec, self._goal = spec, ""
+        self._ros: Any = None
 
     def connect(self) -> ArmFacts:
         self.close()
-        self._received, self._reading, self._problem = 0.0, None, ""
+        self._received, self._problem = 0.0, ""
+        self._reading: Any = None
         self._ros = roslibpy.Ros(self._spec.address, self._spec.port)
         try:
             self._ros.run(5.0)
@@ -73,7 +75,8 @@ class Ros2Robot:
     def read(self) -> JointReading:
         if self._ros is None or not self._ros.is_connected or time.monotonic() > self._received + 1.0:
             raise ConnectionError(f"no joints from rosbridge at {self._spec.address}:{self._spec.port}")
-        return JointReading(*self._reading, self._problem)
+        stamp, joints = self._reading
+        return JointReading(stamp, joints, self._problem)
 
     def begin(self, path: JointPath) -> None:
         points = [
