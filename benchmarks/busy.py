@@ -1,6 +1,7 @@
 """Run the shipped campaigns next to busy processes: nothing that is emulated may fail because the host is slow.
 
-    python benchmarks/busy.py [quickstart night series] [--busy 16] [--runs 10] [--one-core] [--seed 7]
+    python benchmarks/busy.py [quickstart night series] [--busy 16] [--runs 10] [--at-once 1]
+                              [--one-core] [--seed 7]
 
 - `quickstart`: the README's campaign.
 - `night`: mixtures.yaml on rack.yaml, where an arm carries the vessels of six cups.
@@ -17,11 +18,11 @@ import argparse
 import contextlib
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from machine import ROOT, say, started
@@ -48,23 +49,38 @@ def busy_processes(count: int) -> Iterator[None]:
             child.wait()
 
 
-def run_once(name: str, seed: int, folder: Path) -> tuple[int, float, str]:
-    """Run one campaign. Returns its exit code, its time [s] and its messages."""
-    shutil.copytree(ROOT / "configs", folder / "configs")
-    words = [str(folder / "configs" / word) if word.endswith(".yaml") else word for word in COMMANDS[name]]
-    command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "run", *words]
-    environment = {**os.environ, "DECANT_STATE": str(folder / "state")}  # an account of vessels of its own
-    output, begin = folder / "output.txt", time.monotonic()
-    with output.open("wb") as file:
-        child = started([*command, "--seed", str(seed), "--quiet"], env=environment, stdout=file, stderr=file)
-        try:
-            status = child.wait(LONGEST)
-        except subprocess.TimeoutExpired:
-            status = 124
-        finally:
-            child.terminate()
-            child.wait()
-    return status, time.monotonic() - begin, output.read_text(encoding="utf-8").strip()
+@dataclass
+class Run:
+    """A campaign that is under way, in a folder and with an account of vessels of its own."""
+
+    name: str
+    seed: int
+
+    def __post_init__(self) -> None:
+        """Start it."""
+        self._folder = tempfile.TemporaryDirectory(prefix="decant-busy-")
+        folder = Path(self._folder.name)
+        shutil.copytree(ROOT / "configs", folder / "configs")
+        words = [str(folder / "configs" / word) if word.endswith(".yaml") else word for word in COMMANDS[self.name]]
+        command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "run", *words]
+        environment = {**os.environ, "DECANT_STATE": str(folder / "state")}
+        self._output, self._begin = folder / "output.txt", time.monotonic()
+        with self._output.open("wb") as file:
+            child = started([*command, "--seed", str(self.seed), "--quiet"], env=environment, stdout=file, stderr=file)
+        self._child = child
+
+    def ended(self) -> bool:
+        """Whether it has ended; one that has taken `LONGEST` is ended here."""
+        if time.monotonic() - self._begin > LONGEST:
+            self._child.terminate()
+            self._child.wait()
+        return self._child.poll() is not None
+
+    def result(self) -> tuple[int, float, str]:
+        """Exit code, time [s] and messages of a run that has ended; its folder is removed."""
+        seconds, text = time.monotonic() - self._begin, self._output.read_text(encoding="utf-8").strip()
+        self._folder.cleanup()
+        return self._child.returncode, seconds, text
 
 
 def main() -> int:
@@ -75,22 +91,29 @@ def main() -> int:
     )
     parser.add_argument("--busy", type=int, default=16, help="number of busy processes")
     parser.add_argument("--runs", type=int, default=10, help="of each campaign")
+    parser.add_argument("--at-once", type=int, default=1, help="runs beside each other: each makes the others slower")
     parser.add_argument("--one-core", action="store_true", help="everything on one core")
     parser.add_argument("--seed", type=int, default=7, help="of the first run; each further run has the next one")
     chosen = parser.parse_args()
     if chosen.one_core:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    cores, failures = len(os.sched_getaffinity(0)), 0
+    cores, failures, count = len(os.sched_getaffinity(0)), 0, 0
+    waiting = [(name, chosen.seed + n) for name in chosen.campaigns or ["quickstart"] for n in range(chosen.runs)]
+    total = len(waiting)
+    running: list[Run] = []
     with busy_processes(chosen.busy):
-        for name in chosen.campaigns or ["quickstart"]:
-            for number in range(chosen.runs):
-                with tempfile.TemporaryDirectory(prefix="decant-busy-") as folder:
-                    status, seconds, words = run_once(name, chosen.seed + number, Path(folder))
-                failures += status != 0
-                load = os.getloadavg()[0]
+        while waiting or running:
+            while waiting and len(running) < chosen.at_once:
+                running.append(Run(*waiting.pop(0)))
+            time.sleep(0.2)
+            for run in [run for run in running if run.ended()]:
+                running.remove(run)
+                status, seconds, text = run.result()
+                failures, count = failures + (status != 0), count + 1
                 say(
-                    f"{name} {number + 1}/{chosen.runs}: exit {status} after {seconds:.0f} s ({chosen.busy} busy, "
-                    f"{cores} cores, load {load:.0f}){f': {words}' if status else ''}"
+                    f"{count}/{total}: {run.name} with seed {run.seed}: exit {status} after {seconds:.0f} s "
+                    f"({chosen.busy} busy, {chosen.at_once} at once, {cores} cores, load {os.getloadavg()[0]:.0f})"
+                    f"{f': {text}' if status else ''}"
                 )
     return 1 if failures else 0
 
