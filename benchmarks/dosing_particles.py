@@ -1,18 +1,21 @@
 """Pour doses of particles in closed loop: the dose controller decides, and meets a liquid that it was not written for.
 
-    python benchmarks/dosing_particles.py --final --json   # the evidence page's table: docs/data/dosing-particles.json
+    python benchmarks/dosing_particles.py --final --into FILE --json   # the page's docs/data/dosing-particles.json
     python benchmarks/dosing_particles.py --rows mug --series 2
 
 The bench, its balance and its arm are those of benchmarks/dosing.py; cup, receiver and stream are simulated
 (`actors.dosing.particle_liquid`). Each series is five doses of 10 to 100 g (2 to 10 g in the row 'small amounts'),
 log-uniform, from a source that is 40 to 90 % full and is filled again when it holds too little. The receiver stands
 where the row's placement says; the grip's error is drawn as on the formula's bench. Development used the seeds below
-8000. The final ones begin at 8000.
+8000. The final ones begin at 8003: those before were used while the balance did not feel the stream's impact.
+
+The run may be interrupted: `--into FILE` appends each finished series to a file as a line of JSON, and the next run
+with this file makes the others. The first series of all rows come first, then the second ones.
 
 Goals, fixed before the final seeds were used: from the beaker with a spout, the round beaker, mug, cone and bowl a mean
 error of 0.4 g, 1.0 g in 95 %, none beyond 2 g that was reported as reached; small amounts 0.25 g; rapeseed oil and
 glycerol 0.5 g. From the narrow cup, and into the narrow receiver, part of the stream may miss: no dose beyond its
-tolerance may be reported as reached.
+tolerance may be reported as reached. 85 to 95 % of the true amounts lie within the stated intervals.
 """
 
 from __future__ import annotations
@@ -23,8 +26,8 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -51,7 +54,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from dosing import CUPS, OIL, PARTICLES, ROOT, cup_spec
 
 DATA = ROOT / "docs" / "data" / "dosing-particles.json"
-FIRST_SEED, FIRST_FINAL_SEED, SERIES, DOSES = 7000, 8000, 8, 5
+FIRST_SEED, FIRST_FINAL_SEED, SERIES, DOSES = 7000, 8003, 8, 5
 AMOUNTS, SMALL = (0.01, 0.1), (0.002, 0.01)
 FALL = 0.15
 GLYCEROL = {"name": "glycerol 50 %", "density": 1126.0, "dynamic_viscosity": 6e-3, "surface_tension": 0.068}
@@ -217,6 +220,38 @@ def figures(doses: Sequence[Dose]) -> dict[str, Any]:
     }
 
 
+def finished(file: Path | None) -> dict[tuple[str, int], list[Dose]]:
+    """The series of a file that `--into` has written, by row and seed. A last line that was cut off does not count."""
+    series = {}
+    lines = file.read_text(encoding="utf-8").splitlines(keepends=True) if file is not None and file.exists() else []
+    for line in lines:
+        if line.endswith("\n"):
+            record = json.loads(line)
+            series[record["row"], record["seed"]] = [Dose(**dose) for dose in record["doses"]]
+    return series
+
+
+def append(file: Path, row: str, seed: int, doses: Sequence[Dose]) -> None:
+    """Append a series to a file, in a line of its own also after a line that was cut off."""
+    text = file.read_text(encoding="utf-8") if file.exists() else ""
+    record = json.dumps({"row": row, "seed": seed, "doses": [asdict(dose) for dose in doses]})
+    whole = text[: text.rfind("\n") + 1]
+    file.write_text(whole + record + "\n", encoding="utf-8")
+
+
+def write(series: dict[tuple[str, int], list[Dose]], names: Sequence[str]) -> None:
+    """Write the figures of rows into the page's data."""
+    from machine import describe
+
+    rows, machine = {}, describe()
+    for name in names:
+        seeds = sorted(seed for row, seed in series if row == name)
+        doses = [dose for seed in seeds for dose in series[name, seed]]
+        if doses:
+            rows[name] = {**figures(doses), "seeds": [seeds[0], seeds[-1]], "machine": machine}
+    DATA.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
+
+
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -225,23 +260,26 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=FIRST_SEED, help="first development seed")
     parser.add_argument("--rows", nargs="*", choices=list(ROWS), default=list(ROWS), help="sources and placements")
     parser.add_argument("--workers", type=int, default=2, help="number of processes")
+    parser.add_argument("--into", type=Path, help="file of finished series, which are not made again")
     parser.add_argument("--json", action="store_true", help=f"write {DATA.relative_to(ROOT)}")
     options = parser.parse_args()
     first = FIRST_FINAL_SEED if options.final else options.first
-    seeds = range(first, first + options.series)
+    wanted = [(name, seed) for seed in range(first, first + options.series) for name in options.rows]
+    before = finished(options.into)
+    series = {key: before[key] for key in wanted if key in before}
     with ProcessPoolExecutor(options.workers) as pool:
-        for name in options.rows:
-            doses = [dose for poured in pool.map(loss_series, [name] * len(seeds), seeds) for dose in poured]
+        jobs = {pool.submit(loss_series, *key): key for key in wanted if key not in series}
+        for job in as_completed(jobs):
+            (name, seed), doses = jobs[job], job.result()
+            series[name, seed] = doses
+            if options.into is not None:
+                append(options.into, name, seed, doses)
             for dose in doses:
-                print(f"  {dose}", flush=True)
-            found = figures(doses)
-            print(f"{name}: {json.dumps(found)}", flush=True)
-            if options.json:
-                from machine import describe
-
-                data = json.loads(DATA.read_text(encoding="utf-8")) if DATA.exists() else {"rows": {}}
-                data["rows"][name] = {**found, "seeds": [seeds[0], seeds[-1]], "machine": describe()}
-                DATA.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+                print(f"  {name}: {dose}", flush=True)
+    for name in options.rows:
+        print(f"{name}: {json.dumps(figures([dose for key in wanted if key[0] == name for dose in series[key]]))}")
+    if options.json:
+        write(series, options.rows)
 
 
 if __name__ == "__main__":

@@ -5,8 +5,8 @@ along them, and changes the load on the balance's emulator. It is used for doses
 the motion (`actors.bench.virtual_bench`). The liquid of a dose is a `PourTask`, poured as particles in another process,
 or a `FormulaLiquid`: the cup of `actors.dosing.virtual_dosing_bench`.
 
-Limitations: every dose begins with an empty receiver, which does not run over; the liquid falls without impact on the
-balance. Of a formula liquid, straight cups only; the receiver is hit wherever it stands.
+Limitations: every dose begins with an empty receiver, which does not run over. Of a formula liquid, straight cups only;
+the receiver is hit wherever it stands.
 """
 
 from __future__ import annotations

@@ -4,13 +4,17 @@
 placement are those of a scene: what misses the receiver is spilled, and nothing else is assumed about the flow.
 `dose_task` is the `PourTask` of a dose.
 
-Limitations: every dose begins with an empty receiver, which does not run over; the impact on the balance is left out;
-a film thinner than a particle does not flow.
+The balance feels the weight of what has arrived and the impact of what arrives, as a scale under a stream does: in a
+steady flow the impact weighs as much as the liquid in the air.
+
+Limitations: every dose begins with an empty receiver, which does not run over; what falls onto a tray has no impact; a
+film thinner than a particle does not flow.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -20,6 +24,8 @@ from numpy.typing import NDArray
 from actors.dosing.virtual_dosing_bench import TIME_STEP, VirtualDosingBench
 from actors.interfaces import InvalidActionError, LaboratoryError
 from sim_engine.action import Action
+from sim_engine.collision import rotations
+from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquids import SimulationParameters
 from sim_engine.live_pour import LivePours
 from sim_engine.motion import recorded_motion
@@ -38,6 +44,9 @@ LANDING, LANDING_STEP = 0.5, 0.02
 
 FRAME_INTERVAL = 0.1
 """Time between two frames of the particles for the live view [s]."""
+
+IMPACT_TIME = 0.1
+"""Time over which the impact of single particles is averaged [s]."""
 
 LEAST_PARTICLES = 30
 """Smallest number of particles of a dose; one of them is then 3 % of the amount."""
@@ -109,11 +118,17 @@ class ParticleFlow:
         self._active = 0.0  # last time at which the pourer moved or liquid flowed
         self._in_flight = self.received = self.spilled = 0.0
         self.left = self._content = task.scene.liquid.mass
+        self._lip = build_vessel(task.scene.pourer).meridians[:, -1]  # points of its crest
+        self._opening = build_vessel(task.scene.receiver).rim_height + task.placement.z
+        self._arrived = deque([(0.0, 0.0)])  # times [s] and masses in the receiver [kg]
         self._next_frame = 0.0
         self._frames: list[tuple[float, NDArray[np.float32], NDArray[np.uint8], Floats]] = []
 
     def follow(self, times: Floats, poses: Floats) -> float:
-        """Pour along poses (T, 7) of the pourer at times since the begin [s]. Returns the mass in the receiver [kg].
+        """Pour along poses (T, 7) of the pourer at times since the begin [s].
+
+        Returns:
+            Load on the balance without the receiver, with the impact of the stream [kg].
 
         Raises:
             LaboratoryError: the simulation failed.
@@ -128,7 +143,7 @@ class ParticleFlow:
         if self._watched and self._time >= self._next_frame:
             self._next_frame = self._time + FRAME_INTERVAL
             self._frames.append((self._time, *self._pours.particles(), self._pose))
-        return self.received
+        return self.received + self._impact()
 
     def land(self) -> None:
         """Let everything land that still falls. A drop that hangs is left. Raises like `follow`."""
@@ -145,6 +160,20 @@ class ParticleFlow:
             return None
         times, positions, states, poses = zip(*frames, strict=True)
         return RecordedFrames(np.array(times), list(positions), list(states), np.array(poses))
+
+    def _impact(self) -> float:
+        """Force on the receiver from what has just entered its opening, as a mass [kg]."""
+        # m' v / g with v = √(2 g h): a free fall from rest at the lip's lowest point to the opening; what is below the
+        # opening counts with its whole weight, also while it falls
+        arrived = self._arrived
+        arrived.append((self._time, self.received))
+        while len(arrived) > 2 and arrived[1][0] <= self._time - IMPACT_TIME + 1e-9:
+            arrived.popleft()
+        (begin, before), (end, now) = arrived[0], arrived[-1]
+        if now <= before:
+            return 0.0
+        lip = float(self._pose[2] + (self._lip @ rotations(self._pose[None])[0].T)[:, 2].min())
+        return (now - before) / (end - begin) * math.sqrt(2.0 * max(lip - self._opening, 0.0) / GRAVITY)
 
     def _advance(self, times: Floats, poses: Floats) -> None:
         state = self._pours.advance(times, poses)
@@ -196,11 +225,11 @@ class ParticleLiquid:
         assert not missed, "where the stream lands is simulated"
         self._k += 1
         moved = self._moved(tilt - self._bench.grip)
-        self._particles.follow(moved.times[1:], moved.poses[1:])
+        load = self._particles.follow(moved.times[1:], moved.poses[1:])
         if self._show is not None and (frames := self._particles.frames()) is not None:
             self._show(frames)
         self._note()
-        return self.received
+        return load
 
     def at_rest(self) -> float:
         """See `actors.dosing.virtual_dosing_bench.PouredLiquid`."""

@@ -34,18 +34,38 @@ def simulator() -> Iterator[PourSimulator]:
     started.close()
 
 
+def particles(simulator: PourSimulator, bench: VirtualDosingBench, aside: float = 0.0) -> ParticleLiquid:
+    """The content of a bench's beaker, of which 1 g is a particle."""
+    theta = SimulationParameters(particles=round(300 * bench.content / 0.3))
+    scene = Scene("dose", BEAKER, BOWL, Liquid(mass=bench.content))
+    task = PourTask(scene, ACTION, theta, 1, pose_error=PoseError(x=aside))
+    return ParticleLiquid(bench, LocalLivePours(simulator), task)
+
+
 def benches(simulator: PourSimulator, aside: float = 0.0) -> tuple[VirtualDosingBench, DoseSeries]:
     """A beaker with 300 g of water as 300 particles, and the doses from it."""
-
-    def liquid(bench: VirtualDosingBench) -> ParticleLiquid:
-        poured = Liquid(mass=bench.content)
-        theta = SimulationParameters(particles=round(300 * bench.content / 0.3))
-        task = PourTask(Scene("dose", BEAKER, BOWL, poured), ACTION, theta, 1, pose_error=PoseError(x=aside))
-        return ParticleLiquid(bench, LocalLivePours(simulator), task)
-
-    bench = VirtualDosingBench(TrueCup(0.04, 0.1), Liquid(mass=0.3), TrueScale(lag=0.2), 3, poured=liquid)
+    bench = VirtualDosingBench(
+        TrueCup(0.04, 0.1),
+        Liquid(mass=0.3),
+        TrueScale(lag=0.2),
+        3,
+        poured=lambda bench: particles(simulator, bench, aside),
+    )
     flow, rng = CupFlow(simulator.vessel(BEAKER), Liquid(mass=0.1)), np.random.default_rng(3)
     return bench, DoseSeries(flow, DosingSettings(), SourceContent(0.3), bench.place_receiver(), rng, particles=60)
+
+
+@pytest.mark.slow
+def test_the_impact_of_a_stream_weighs_as_much_as_the_liquid_in_the_air(simulator: PourSimulator) -> None:
+    bench, _ = benches(simulator)
+    liquid, impacts, in_the_air = particles(simulator, bench), [], []
+    for k in range(430):  # 65° in 1.5 s
+        load = liquid.step(65 * DEG * min(k / 300, 1.0), 0.0)
+        if liquid.received > 0.02:
+            impacts.append(load - liquid.received)
+            in_the_air.append(0.3 - bench.content - liquid.received - liquid.spilled)
+    assert len(impacts) > 50
+    assert np.mean(impacts) == pytest.approx(np.mean(in_the_air), rel=0.3)
 
 
 @pytest.mark.slow
