@@ -55,6 +55,10 @@ from actors.runtime.bench_clock import device_clock
 _REOPEN_INTERVAL = 0.2
 _GLANCE = 0.1
 
+LATEST = 0.2
+"""Time between two looks at the line during a weighing, for which the clock of a virtual bench waits [s of bench time].
+Otherwise a busy host would leave room for a few readings only until a weight must have settled."""
+
 
 class Conversation:
     """The connection to one balance.
@@ -225,24 +229,33 @@ class Conversation:
         self.open()
         assert self._wire is not None
         wait = self._asked_at + self.interval - self.clock.now
-        if wait > 0.0:
-            self._interrupted.wait(wait)
-        self._asked_at = self.clock.now
         try:
+            self._promise(max(wait, 0.0))
+            if wait > 0.0:
+                self._interrupted.wait(wait)
+            self._asked_at = self.clock.now
             self._wire.flush()
             yield self._wire
         except PortLostError:
             self.close()
             raise
+        finally:
+            self.clock.withdraw("weighing")
 
     def _line(self, wire: Wire, end: float) -> bytes | None:
         """Return the next line; checks for an interruption while waiting."""
         while not self._interrupted.is_set():
             left = end - self.clock.now
-            line = wire.line_until(time.monotonic() + min(left, _GLANCE))
+            glance = min(left, _GLANCE, LATEST / self.time_scale)
+            self._promise(glance)
+            line = wire.line_until(time.monotonic() + glance)
             if line is not None or left <= 0.0:
                 return line
         return None
+
+    def _promise(self, wait: float) -> None:
+        """Let the clock of a virtual bench stand if this thread is late after a wait [s of the clock]."""
+        self.clock.promise("weighing", wait + LATEST / self.time_scale)
 
     def _decoded(self, line: bytes) -> Reply | None:
         try:
@@ -370,6 +383,7 @@ class SerialBalance:
 
     def weigh(self) -> Weight:
         """See `BalanceDriver.weigh`; waits until the weight has settled."""
+        self._open()  # to find out which balance it is takes seconds, which are not of this weighing
         settled, seen = self._settle(reference_needed=True), self._display
         mass = settled.mass - self._kept_tare
         return Weight(mass, True, settled.time, str(ReadingStatus.STABLE), seen.step, seen.last.shown)

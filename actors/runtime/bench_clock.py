@@ -79,9 +79,9 @@ LONGEST_STAND = 20.0
 PATIENCE = 10.0
 """Factor of the wall-time limits of starting and answering processes on a virtual bench, whose host may be slow."""
 
-PROGRAMS = ("arm", "dose", "liquid", "balance")
-"""Programs that may make a promise: the arm's worker, the control loop of a dose, the liquid that flows in it, and the
-emulated balance."""
+PROGRAMS = ("arm", "dose", "liquid", "balance", "weighing")
+"""Programs that may make a promise: the arm's worker, the control loop of a dose, the liquid that flows in it, the
+emulated balance, and the driver that reads it."""
 
 _NOW, _WRITTEN, _FIRST = 0, 1, 2
 

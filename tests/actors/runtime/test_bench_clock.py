@@ -6,11 +6,15 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import pytest
 
+from actors.balance.balance_settings import SerialBalanceSettings
+from actors.balance.serial_balance import SerialBalance
+from actors.balance.serial_port import Wire
 from actors.bench.virtual_bench import CREEP, standing
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.runtime import bench_clock
@@ -70,6 +74,42 @@ def test_it_waits_for_an_emulated_balance_that_the_host_delays(file: Path) -> No
     finally:
         balance.close()
     assert controller.may_pass(1e6)
+
+
+def test_a_weight_settles_however_late_the_driver_of_the_balance_is(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At thirty times its pace a weight must settle in 0.67 s of the clock; a busy host woke the driver three times."""
+    clock, ended = SharedClock(file), threading.Event()
+
+    def turn() -> None:
+        """The clock passes as fast as it may: a host on which all programs but the controller are late."""
+        while not ended.is_set():
+            if clock.may_pass(0.001):
+                clock.advance(0.001)
+            else:
+                time.sleep(1e-3)
+
+    def late(wire: Wire, end: float) -> bytes | None:
+        line = line_until(wire, end)
+        time.sleep(0.1)  # the host is busy
+        return line
+
+    line_until = Wire.line_until
+    monkeypatch.setattr(Wire, "line_until", late)
+    balance = VirtualSerialBalance.start(baud=0, time_scale=30.0, latency=0.002, clock=str(file))
+    spec = SerialBalanceSettings(port=balance.port, dialect="kcp", time_scale=30.0, clock=str(file))
+    driver, controller = SerialBalance(spec), threading.Thread(target=turn, daemon=True)
+    try:
+        balance.put(0.1234)
+        controller.start()
+        assert driver.weigh().mass == pytest.approx(0.1234, abs=1e-3)
+    finally:
+        ended.set()
+        controller.join()
+        driver.close()
+        balance.close()
+    assert clock.may_pass(1e6), "it does not wait for a driver that weighs nothing"
 
 
 def test_it_goes_on_without_its_controller_and_without_a_program_that_hangs(
