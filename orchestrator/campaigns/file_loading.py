@@ -16,7 +16,6 @@ from orchestrator.campaigns.campaign_file import CampaignFile
 from orchestrator.campaigns.campaign_prior import KnownPosterior, PosteriorSource, ResolvedPrior, no_posteriors
 from orchestrator.campaigns.campaign_resolution import resolve_campaign
 from orchestrator.campaigns.file_references import MESH_SUFFIXES, References, VesselFile, resolve_vessel
-from orchestrator.campaigns.run_snapshot import as_file
 from orchestrator.campaigns.yaml.file_access import resolved
 from orchestrator.campaigns.yaml.section_validation import validate
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
@@ -153,16 +152,6 @@ def load_laboratory(path: Path, *, stored: bool = True) -> LaboratorySettings:
     report.raise_if_any()
     assert laboratory is not None, "a laboratory without problems is ready"
     return laboratory
-
-
-def laboratory_record(path: Path) -> dict[str, Any]:
-    """The laboratory of a file as a record, ready for JSON: loading it gives the same. Raises ConfigError."""
-    report = Report()
-    references = References(report)
-    section = references.file(resolved(path), LaboratorySettings)
-    report.raise_if_any()
-    assert section is not None, "a laboratory without problems has settings"
-    return as_file(*section, references)
 
 
 class _LooseQuantity(Quantity):

@@ -119,7 +119,7 @@ def list_vessels(
             places = where.places()
             rows = [
                 {"id": content.vessel, "position": places[content.vessel].text if content.vessel in places else ""}
-                | {"parts": where.composition(content.vessel), **content.json_content()}
+                | {"parts": where.composition(content.vessel), **content.content.model_dump()}
                 for content in where.all()
             ]
     if not rows:
@@ -145,7 +145,7 @@ def _show_entries(vessel: str, limit: int, url: str | None, state: Path | None) 
         if not isinstance(where, VesselAccount):
             rows = where.get("/materials/account", vessel=vessel, limit=limit)
         else:
-            rows = [entry.json_entry() for entry in reversed(where.history(vessel, limit))]
+            rows = [content.entry.model_dump() for content in reversed(where.history(vessel, limit))]
     if not rows:
         print_message(f"{vessel}: has no entry; 'decant materials list' lists the vessels")
     for row in rows:

@@ -30,6 +30,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import BaseModel
+
 from actors.interfaces import LaboratoryError
 from orchestrator.learning.campaign_plan import DispensePlan
 from orchestrator.learning.dispense import ENOUGH, KnownSource, left_after
@@ -74,6 +76,38 @@ LOCK_TIMEOUT = 1.0
 """Longest wait for another process that writes [s]."""
 
 
+class ContentOut(BaseModel):
+    """Content of a vessel."""
+
+    mass_g: float | None
+    """Null if a pour with unknown outcome has changed it."""
+
+    deviation_g: float
+    liquid: str
+    since: float
+    pour: str
+    """The pour that changed it last: its caller's id, or run and number; '' after a weighing."""
+
+    weighed: float | None
+    """Time of the last weighing."""
+
+
+class AccountOut(BaseModel):
+    """One entry of a vessel's account."""
+
+    t: float
+    vessel: str
+    kind: EntryKind
+    mass_g: float | None
+    """Content after it; null if it is unknown."""
+
+    deviation_g: float
+    liquid: str
+    pour: str
+    by: str
+    note: str
+
+
 @dataclass(frozen=True)
 class VesselContent:
     """Content of a vessel after one entry of the account.
@@ -104,28 +138,32 @@ class VesselContent:
     weighed: float | None = None
     knowledge: dict[str, Any] | None = None
 
-    def json_content(self) -> dict[str, Any]:
-        """The content for JSON, masses in g."""
-        return {
-            "mass_g": None if self.mass is None else 1e3 * self.mass,
-            "deviation_g": 1e3 * self.deviation,
-            "liquid": self.liquid,
-            "since": self.time,
-            "pour": self.pour,
-            "weighed": self.weighed,
-        }
+    @property
+    def content(self) -> ContentOut:
+        """The content for programs."""
+        return ContentOut(
+            mass_g=None if self.mass is None else 1e3 * self.mass,
+            deviation_g=1e3 * self.deviation,
+            liquid=self.liquid,
+            since=self.time,
+            pour=self.pour,
+            weighed=self.weighed,
+        )
 
-    def json_entry(self) -> dict[str, Any]:
-        """The entry for JSON, masses in g."""
-        content = self.json_content()
-        return {
-            "t": self.time,
-            "vessel": self.vessel,
-            "kind": self.kind,
-            **{name: content[name] for name in ("mass_g", "deviation_g", "liquid", "pour")},
-            "by": self.by,
-            "note": self.note,
-        }
+    @property
+    def entry(self) -> AccountOut:
+        """The entry for programs."""
+        return AccountOut(
+            t=self.time,
+            vessel=self.vessel,
+            kind=self.kind,
+            mass_g=None if self.mass is None else 1e3 * self.mass,
+            deviation_g=1e3 * self.deviation,
+            liquid=self.liquid,
+            pour=self.pour,
+            by=self.by,
+            note=self.note,
+        )
 
 
 @dataclass(frozen=True)

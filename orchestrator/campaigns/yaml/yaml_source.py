@@ -90,6 +90,18 @@ class Document:
             raise ConfigError([Problem(path, 0, 0, "", str(error))]) from None
 
     @classmethod
+    def of(cls, data: dict[str, Any], path: Path) -> Document:
+        """Values that a program has made, as if they were in this file; problems have their keys but no lines."""
+        document = cls(path, data=data)
+        waiting: list[tuple[Loc, Any]] = [((), data)]
+        while waiting:
+            loc, value = waiting.pop()
+            document.marks[loc] = SourcePosition((0, 0), (0, 0), True)
+            inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+            waiting += [((*loc, key), item) for key, item in inner]
+        return document
+
+    @classmethod
     def parse(cls, text: str, path: Path) -> Document:
         """Parse a text as the content of the file.
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from orchestrator.daemon.rigs.pour_request import AfterIn, Moment, RequestModel
+from orchestrator.daemon.rigs.pour_request import AfterIn, Moment, RequestModel, ResponseModel
 from orchestrator.learning.dispense import MixedComponent
 from orchestrator.records.verdict import Verdict
 from orchestrator.reports.run_summary import PourSummary
@@ -18,12 +18,6 @@ from orchestrator.reports.run_summary import PourSummary
 def text_response(media_type: str, description: str) -> dict[str, Any]:
     """Description of a response that is text of another media type than JSON."""
     return {"content": {media_type: {"schema": {"type": "string"}}}, "description": description}
-
-
-class ResponseModel(BaseModel):
-    """Base of the models of responses."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
 
 
 class AnswerIn(RequestModel):
@@ -72,7 +66,7 @@ class HealthOut(ResponseModel):
     """Health of the daemon."""
 
     ok: bool
-    problems: list[str] = []
+    problems: list[str] = Field(default_factory=list)
 
 
 class ProgressOut(ResponseModel):
@@ -178,11 +172,11 @@ class NightEventOut(ResponseModel):
 class CampaignDetailOut(CampaignOut):
     """A submitted campaign with its results so far."""
 
-    pours_made: list[PourSummary] = []
-    night: list[NightEventOut] = []
+    pours_made: list[PourSummary] = Field(default_factory=list)
+    night: list[NightEventOut] = Field(default_factory=list)
     """Unattended pours since the first consent; empty without one."""
 
-    mixtures: list[MixedComponent] = []
+    mixtures: list[MixedComponent] = Field(default_factory=list)
     """Each liquid of each cup of mixtures so far; empty without mixtures."""
 
     rack: str = ""

@@ -33,7 +33,7 @@ from starlette.exceptions import HTTPException as AnyHTTPException
 
 from orchestrator.daemon.api.access_control import invalid, refused
 from orchestrator.daemon.rigs.emergency_stop import StopForms
-from orchestrator.daemon.rigs.ordering import Ordering
+from orchestrator.daemon.rigs.ordering import Ordering, PourOut
 from orchestrator.daemon.rigs.pour_request import JsonModel, PourIn, SubmissionIn, described, problems_text
 from orchestrator.daemon.rigs.supervisor import Supervisor
 from orchestrator.daemon.state.daemon_settings import MadsciSettings, networks
@@ -195,7 +195,7 @@ class MadsciNode:
         order = self._ordering.book.of_campaign(item.id)
         if order is None:
             return item.state != "failed"
-        return _status_of(await self._ordering.pour_out(order["id"])) in ("running", "unknown")
+        return _status_of(await self._ordering.pour_out(order.id)) in ("running", "unknown")
 
     # ---- actions
 
@@ -240,7 +240,7 @@ class MadsciNode:
     async def _start(self, action: NodeAction) -> None:
         """The order has the action's id, so an interrupted start is repeated without a second pour."""
         error: str | None = None
-        predicted: dict[str, Any] | None = None
+        forecast: str | None = None
         try:
             if action.name == "run_campaign":
                 args = {name: action.args.get(name, "") for name in ("path", "rig")}
@@ -249,12 +249,11 @@ class MadsciNode:
             dry = action.name == "predict_pour"
             request = PourIn.model_validate({**action.args, "id": action.id, "dry_run": dry})
             pour = await self._ordering.pour(request, PERSON)
-            predicted = pour if dry else None
+            forecast = pour.model_dump_json() if dry else None
         except ValidationError as problem:
             error = f"args: {problems_text(problem.errors())}"
         except RunError as problem:
             error = str(problem)
-        forecast = None if predicted is None else json.dumps(predicted)
         if error is not None or forecast is not None:
             self._store.write(
                 "update node_action set started = ?, error = ?, json_result = ? where id = ?",
@@ -279,8 +278,8 @@ class MadsciNode:
             about: dict[str, Any] = {"campaign": item.id, "state": item.state, "run": item.run, "reason": reason}
             about["verdict"] = item.verdict
         else:
-            about = await self._ordering.pour_out(action.id)
-            status, reason = _status_of(about), str(about["reason"] or "")
+            pour = await self._ordering.pour_out(action.id)
+            about, status, reason = pour.model_dump(), _status_of(pour), pour.reason
         waits = self._queue.waits_for(item) if status in ("running", "unknown") else ""
         match status:
             case "running":
@@ -363,7 +362,7 @@ def create_node(daemon: Supervisor, ordering: Ordering, settings: MadsciSettings
 
     @app.get("/state")
     async def state() -> Any:
-        return ordering.materials.everything(daemon.shared.running_laboratories)
+        return ordering.materials.everything(daemon.shared.running_laboratories).model_dump()
 
     @app.get("/log")
     async def log() -> Any:
@@ -434,13 +433,13 @@ def _refused(text: str) -> dict[str, Any]:
     return {"success": False, "errors": [_error(text)], "data": None}
 
 
-def _status_of(pour: dict[str, Any]) -> str:
+def _status_of(pour: PourOut) -> str:
     """Status word of a pour. An unknown outcome that no operator can state any more is a failure, and so is an amount
     beyond its tolerance."""
-    result = pour["result"]
-    if result is not None and (pour["state"] == "unknown" or result.get("within_tolerance") is False):
+    result = pour.result
+    if result is not None and (pour.state == "unknown" or result.within_tolerance is False):
         return "failed"
-    return _STATUS.get(pour["state"], "running")
+    return _STATUS.get(pour.state, "running")
 
 
 def _action(row: dict[str, Any]) -> NodeAction:

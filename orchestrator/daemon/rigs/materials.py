@@ -18,10 +18,11 @@ from typing import Any
 from orchestrator.campaigns.file_loading import liquid_from, vessel_from
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.campaigns.yaml.yaml_source import Document
+from orchestrator.daemon.rigs.pour_request import ResponseModel
 from orchestrator.daemon.state.daemon_store import ENDED, Store
 from orchestrator.learning.dispense import ENOUGH
 from orchestrator.learning.run_errors import RunError
-from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, VesselAccount, VesselContent
+from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, ContentOut, VesselAccount, VesselContent
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import Liquid
 from sim_engine.settings.quantity import QuantityError, parse_quantity
@@ -59,6 +60,61 @@ class RegisteredVessel:
     shape: dict[str, Any]
     capacity: float
     position: str
+
+
+class VesselOut(ResponseModel):
+    """A vessel with its content."""
+
+    id: str
+    code: str
+    position: str
+    capacity_ml: float
+    content: ContentOut
+    promised_g: float
+    """Amounts that queued pours will take."""
+
+
+class SourceOut(ResponseModel):
+    """A vessel that is not registered: the source of a campaign."""
+
+    id: str
+    """LABORATORY/VESSEL."""
+
+    position: str
+    """Place of the laboratory where it stands; UNKNOWN after an interrupted motion; '' without places."""
+
+    in_use: bool
+    """Whether a campaign runs in its laboratory: it may move, and its content be weighed later."""
+
+    content: ContentOut
+
+
+class LiquidOut(ResponseModel):
+    """A liquid."""
+
+    id: str
+    code: str
+    properties: dict[str, Any]
+
+
+class PositionOut(ResponseModel):
+    """A position."""
+
+    id: str
+    code: str
+    rig: str
+    note: str
+
+
+class MaterialsOut(ResponseModel):
+    """All materials of the station."""
+
+    liquids: list[LiquidOut]
+    vessels: list[VesselOut]
+    sources: list[SourceOut]
+    """Sources of campaigns, which need no registration."""
+
+    positions: list[PositionOut]
 
 
 class Materials:
@@ -265,35 +321,33 @@ class Materials:
             raise MaterialError(f"there is no {table} '{key[:80]}'; there are {', '.join(ids) or 'none'}")
         return rows[0]
 
-    def everything(self, running: Collection[str] = ()) -> dict[str, list[dict[str, Any]]]:
-        """Return all materials, with the contents of the vessels; ready for JSON, masses in g and volumes in ml.
+    def everything(self, running: Collection[str] = ()) -> MaterialsOut:
+        """Return all materials, with the contents of the vessels.
 
         Args:
             running: names of the laboratories in which a campaign runs.
         """
         contents = {content.vessel: content for content in self.account.all()}
         vessels = []
-        for row in self._store.rows("select * from vessel order by id"):
+        for row in self._store.rows(
+            "select id, coalesce(code, '') as code, coalesce(position, '') as position, 1e6 * capacity as capacity_ml "
+            "from vessel order by id"
+        ):
             held = contents.pop(row["id"], None) or VesselContent(row["id"], 0.0, "weighed", 0.0, 0.0)
-            vessels.append(
-                {
-                    "id": row["id"], "code": row["code"] or "", "position": row["position"] or "",
-                    "capacity_ml": 1e6 * row["capacity"], "content": held.json_content(),
-                    "promised_g": 1e3 * self.promised(row["id"]),
-                }
-            )  # fmt: skip
+            vessels.append(VesselOut(**row, content=held.content, promised_g=1e3 * self.promised(row["id"])))
         places = self.account.places()
         sources = []
         for name, held in contents.items():
             place, in_use = places.get(name), name.partition("/")[0] in running
             position = "" if place is None else place.moving_text if in_use else place.text
-            sources.append({"id": name, "position": position, "in_use": in_use, "content": held.json_content()})
+            sources.append(SourceOut(id=name, position=position, in_use=in_use, content=held.content))
         liquids = [
-            {"id": row["id"], "code": row["code"] or "", "properties": json.loads(row["properties"])}
+            LiquidOut(id=row["id"], code=row["code"] or "", properties=json.loads(row["properties"]))
             for row in self._store.rows("select * from liquid order by id")
         ]
-        positions = self._store.rows("select id, coalesce(code, '') as code, rig, note from position order by id")
-        return {"liquids": liquids, "vessels": vessels, "sources": sources, "positions": positions}
+        rows = self._store.rows("select id, coalesce(code, '') as code, rig, note from position order by id")
+        positions = [PositionOut(**row) for row in rows]
+        return MaterialsOut(liquids=liquids, vessels=vessels, sources=sources, positions=positions)
 
     # ---- requests
 

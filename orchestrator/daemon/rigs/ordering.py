@@ -12,13 +12,22 @@ import shutil
 import time
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from actors.interfaces import InvalidActionError, LaboratoryError
 from orchestrator.daemon.rigs.campaign_queue import CampaignQueue, RequestRefusedError
 from orchestrator.daemon.rigs.materials import SURE, Materials
-from orchestrator.daemon.rigs.pour_orders import OrderBook, OrderError, PourOrder, carried_cup, settled_pour
-from orchestrator.daemon.rigs.pour_request import PourIn, SubmissionIn
+from orchestrator.daemon.rigs.pour_orders import (
+    OrderBook,
+    OrderError,
+    PlacedOrder,
+    PourOrder,
+    PredictionOut,
+    WeighedOut,
+    carried_cup,
+    settled_pour,
+)
+from orchestrator.daemon.rigs.pour_request import PourIn, ResponseModel, SubmissionIn
 from orchestrator.daemon.rigs.rig_worker import SharedServices
 from orchestrator.daemon.rigs.submissions import Submission, planned_order, prepare, receive
 from orchestrator.daemon.state.daemon_store import REFUSED, QueueItem
@@ -32,7 +41,57 @@ RESTING = ("weighed", "failed", "unknown", "cancelled", "paused", "dry run")
 """States in which a pour does not change by itself."""
 
 
+PourState = Literal[
+    "dry run", "queued", "running", "waiting for operator", "paused", "weighed", "failed", "unknown", "cancelled"
+]
+
 Placed = TypeVar("Placed")
+
+
+class LimitsOut(ResponseModel):
+    """Limits of a pour from this source into this receiver."""
+
+    available_g: float
+    """In the source for certain, without amounts that are promised to other pours."""
+
+    room_ml: float
+    """Free volume of the receiver up to the brim."""
+
+
+class PourOut(ResponseModel):
+    """An ordered pour."""
+
+    id: str
+    campaign: str
+    """Id of its campaign in the queue; '' for a dry run."""
+
+    state: PourState
+    """'unknown': it has begun and has no outcome; an operator reports it. It is never repeated by software."""
+
+    reason: str
+    """Reason of the state."""
+
+    needs_enabling: bool
+    """It waits until an operator enables the motion of the hardware."""
+
+    source: str
+    receiver: str
+    amount_g: float | None
+    order: dict[str, Any]
+    """The request."""
+
+    limits: LimitsOut | None = None
+    """Only in a dry run."""
+
+    predicted: PredictionOut | None
+    result: WeighedOut | None
+    run: str | None
+    """Name of its run's folder."""
+
+    created: float | None
+    ended: float | None
+    seconds_left: float | None = None
+    """Expected time until it ends, while it runs."""
 
 
 class Ordering:
@@ -48,15 +107,12 @@ class Ordering:
         self.materials, self.book = Materials(daemon.store), OrderBook(daemon.store)
         self._placing: dict[str, asyncio.Task[Any]] = {}
 
-    async def pour(self, request: PourIn, by: str) -> dict[str, Any]:
+    async def pour(self, request: PourIn, by: str) -> PourOut:
         """Place an order, or return the pour that this order has made already.
 
         Args:
             request: the order.
             by: who orders it.
-
-        Returns:
-            The pour, as `PourOut`.
 
         Raises:
             OrderError, MaterialError, SubmissionError: the order is invalid.
@@ -120,7 +176,7 @@ class Ordering:
     async def _place(self, request: PourIn, body: dict[str, Any], by: str) -> dict[str, Any]:
         """Place an order if its id has none; return the request that the id belongs to."""
         if (earlier := self.book.find(request.id)) is not None:
-            return dict(earlier["body"])
+            return earlier.body
         item, order, predicted = await self._prepared(request, by)
 
         def enter() -> None:
@@ -139,7 +195,7 @@ class Ordering:
             await self._forget(item)
             raise
 
-    async def _prepared(self, request: PourIn, by: str) -> tuple[QueueItem, PourOrder, dict[str, Any] | None]:
+    async def _prepared(self, request: PourIn, by: str) -> tuple[QueueItem, PourOrder, PredictionOut | None]:
         """Check an order and store its snapshot; return them, and the prediction if it is wanted."""
         settings = self._daemon.settings
         order = PourOrder.of(request, self.materials)
@@ -177,7 +233,7 @@ class Ordering:
             raise OrderError(f"rig: name one of {', '.join(names)}, or register the positions of the vessels")
         return name
 
-    async def _predicted(self, item: QueueItem) -> dict[str, Any]:
+    async def _predicted(self, item: QueueItem) -> PredictionOut:
         settings, warm = self._daemon.settings, self._daemon.warm
         planned = await asyncio.to_thread(planned_order, settings, item, settings.rig(item.rig))
         if planned.order.amount is None:
@@ -187,69 +243,73 @@ class Ordering:
         except (InvalidActionError, LaboratoryError) as error:
             raise OrderError(str(error)) from None
 
-    async def _dry_run(self, request: PourIn, by: str) -> dict[str, Any]:
+    async def _dry_run(self, request: PourIn, by: str) -> PourOut:
         item, order, predicted = await self._prepared(request, by)
         await self._forget(item)
         held, target = self.materials.content(order.source), self.materials.content(order.receiver)
         density = self.materials.liquid(order.liquid).density
         sure = (held.mass or 0.0) - SURE * held.deviation - self.materials.promised(order.source)
         room = self.materials.vessel(order.receiver).capacity - (target.mass or 0.0) / density
-        return {
-            "id": order.id,
-            "campaign": "",
-            "state": "dry run",
-            "reason": "nothing was poured",
-            "needs_enabling": False,
-            "source": order.source,
-            "receiver": order.receiver,
-            "amount_g": _grams(order.amount),
-            "order": request.model_dump(),
-            "predicted": predicted,
-            "result": None,
-            "limits": {"available_g": 1e3 * max(sure, 0.0), "room_ml": 1e6 * max(room, 0.0)},
-            "run": None,
-            "created": None,
-            "ended": None,
-        }
+        return PourOut(
+            id=order.id,
+            campaign="",
+            state="dry run",
+            reason="nothing was poured",
+            needs_enabling=False,
+            source=order.source,
+            receiver=order.receiver,
+            amount_g=_grams(order.amount),
+            order=request.model_dump(),
+            limits=LimitsOut(available_g=1e3 * max(sure, 0.0), room_ml=1e6 * max(room, 0.0)),
+            predicted=predicted,
+            result=None,
+            run=None,
+            created=None,
+            ended=None,
+        )
 
     async def _forget(self, item: QueueItem) -> None:
         await asyncio.to_thread(shutil.rmtree, self._daemon.settings.snapshots / item.id, ignore_errors=True)
 
     # ---- states and results
 
-    async def pour_out(self, key: str) -> dict[str, Any]:
-        """Return a pour as `PourOut`. Raises KeyError."""
-        row = self.book.find(key)
-        if row is None:
-            raise KeyError(key)
-        item = self._queue.item(row["campaign"])
-        state, reason = await self._state(item, row)
-        row = self.book.find(key) or row
+    async def pour_out(self, key: str) -> PourOut:
+        """Return a pour by its caller's id. Raises KeyError."""
+        placed = self._placed(key)
+        item = self._queue.item(placed.campaign)
+        state, reason = await self._state(item, placed.result)
+        placed = self._placed(key)
         progress = self._daemon.progress(item)
-        return {
-            "id": key,
-            "campaign": item.id,
-            "state": state,
-            "reason": reason,
-            "needs_enabling": item.mode == "hardware" and not item.motion_enabled and state in ("queued", "paused"),
-            "source": row["source"],
-            "receiver": row["receiver"],
-            "amount_g": _grams(row["amount"]),
-            "order": row["body"],
-            "predicted": row["predicted"],
-            "result": row["result"],
-            "run": item.run,
-            "created": item.created,
-            "ended": item.ended,
-            "seconds_left": None if progress is None else progress["seconds_left"],
-        }
+        return PourOut(
+            id=key,
+            campaign=item.id,
+            state=state,
+            reason=reason,
+            needs_enabling=item.mode == "hardware" and not item.motion_enabled and state in ("queued", "paused"),
+            source=placed.source,
+            receiver=placed.receiver,
+            amount_g=_grams(placed.amount),
+            order=placed.body,
+            predicted=placed.predicted,
+            result=placed.result,
+            run=item.run,
+            created=item.created,
+            ended=item.ended,
+            seconds_left=None if progress is None else progress["seconds_left"],
+        )
 
-    async def _state(self, item: QueueItem, row: dict[str, Any]) -> tuple[str, str]:
-        if (result := row["result"]) is not None:
-            reason = item.reason or str(result["end"])
-            if result.get("within_tolerance") is False:
-                reason = f"missed its tolerance: {result['received_g']:.2f} g received, {result['error_g']:+.2f} g off"
-            return str(result["state"]), reason
+    def _placed(self, key: str) -> PlacedOrder:
+        placed = self.book.find(key)
+        if placed is None:
+            raise KeyError(key)
+        return placed
+
+    async def _state(self, item: QueueItem, result: WeighedOut | None) -> tuple[PourState, str]:
+        if result is not None:
+            reason = item.reason or result.end
+            if result.within_tolerance is False:
+                reason = f"missed its tolerance: {result.received_g:.2f} g received, {result.error_g:+.2f} g off"
+            return result.state, reason
         if item.state == "queued":
             return "queued", item.reason or self._queue.waits_for(item)
         if item.state in ("stopped", "withdrawn"):
@@ -259,9 +319,9 @@ class Ordering:
         ):
             open_question = [q for q in self._daemon.store.questions(campaign=item.id) if q.kind == "bench"]
             return "waiting for operator" if open_question else "unknown", item.reason
-        if item.state in ("paused", "failed"):
-            return item.state, item.reason
-        return ("failed" if item.state == "finished" else "running"), item.reason
+        if item.state == "paused":
+            return "paused", item.reason
+        return ("failed" if item.state in ("failed", "finished") else "running"), item.reason
 
     async def _begun(self, item: QueueItem) -> bool:
         """Whether the journal of a resting pour has a beginning and no outcome."""
@@ -275,21 +335,18 @@ class Ordering:
             return True  # unreadable: it may have begun
         return settled is not None and settled.pour.state in ("under way", "unknown")
 
-    async def wait(self, key: str, seconds: float) -> dict[str, Any]:
+    async def wait(self, key: str, seconds: float) -> PourOut:
         """Return a pour as soon as it rests, or after a time [s]. Raises KeyError."""
         end = time.monotonic() + seconds
         while True:
             pour = await self.pour_out(key)
-            if pour["state"] in RESTING or time.monotonic() >= end or self._daemon.stopping:
+            if pour.state in RESTING or time.monotonic() >= end or self._daemon.stopping:
                 return pour
             await asyncio.sleep(WAIT)
 
     def campaign_of(self, key: str) -> str:
         """Return the campaign's id of a pour. Raises KeyError."""
-        row = self.book.find(key)
-        if row is None:
-            raise KeyError(key)
-        return str(row["campaign"])
+        return self._placed(key).campaign
 
 
 def _grams(mass: float | None) -> float | None:

@@ -19,9 +19,9 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Json
 
 from actors.arm.arm_settings import arm_kind
 from actors.interfaces import DoseSource, DoseTarget, SimulatorPool
@@ -30,11 +30,11 @@ from actors.laboratory_settings import LaboratorySettings
 from actors.places import all_places
 from orchestrator.campaigns.action_assignments import AssignmentError, assigned_action
 from orchestrator.campaigns.campaign_checks import touch
-from orchestrator.campaigns.file_loading import campaign_from, laboratory_record, load_laboratory, vessel_from
+from orchestrator.campaigns.file_loading import campaign_from, load_laboratory, vessel_from
 from orchestrator.campaigns.shipped import shipped
 from orchestrator.campaigns.yaml.yaml_source import Document
 from orchestrator.daemon.rigs.materials import Materials, liquid_of, mass_of
-from orchestrator.daemon.rigs.pour_request import PourIn
+from orchestrator.daemon.rigs.pour_request import PourIn, ResponseModel
 from orchestrator.daemon.state.daemon_settings import Rig
 from orchestrator.daemon.state.daemon_store import QueueItem, Store
 from orchestrator.learning.campaign_plan import CampaignPlan
@@ -78,6 +78,61 @@ class OrderError(RunError):
     """The pour can't be ordered; the message gives the problem and a remedy."""
 
     exit_code = 2
+
+
+class PredictionOut(ResponseModel):
+    """Prediction of a pour; intervals contain it with a probability of 90 %."""
+
+    amount_g: float | None = None
+    """Expected in the receiver."""
+
+    interval_g: tuple[float, float] | None = None
+    error_g: float | None = None
+    """Expected amount minus the wanted amount."""
+
+    error_interval_g: tuple[float, float] | None = None
+    spilled_g: float | None = None
+    duration_s: float | None = None
+    """Expected time until it is weighed, in the rig's own time."""
+
+    reachable_tolerance_g: float | None = None
+    """Half of the interval that contains nine of ten doses as weighed with this balance."""
+
+    enough: float | None = None
+    """Probability that the source holds the amount."""
+
+    ends: dict[str, int] | None = None
+    """Number of predicted pours by their end."""
+
+    simulations: int | None = None
+    """Number of simulations of an action."""
+
+    simulations_lost: int | None = None
+
+
+class WeighedOut(ResponseModel):
+    """Outcome of a pour; intervals state the uncertainty of the balance, with a probability of 90 %."""
+
+    state: Literal["weighed", "failed", "unknown"]
+    received_g: float | None = None
+    """Weighed in the receiver."""
+
+    received_interval_g: tuple[float, float] | None = None
+    spilled_g: float | None = None
+    left_in_source_g: float | None = None
+    error_g: float | None = None
+    """Weighed amount minus the wanted amount."""
+
+    error_interval_g: tuple[float, float] | None = None
+    within_tolerance: bool | None = None
+    end: str = ""
+    """How the pour ended, or why it failed."""
+
+    duration_s: float | None = None
+    """From the first motion until it was weighed, in the rig's own time."""
+
+    seconds: float | None = None
+    """Duration in the journal, operator and balance included."""
 
 
 class PourOrder(BaseModel):
@@ -240,8 +295,7 @@ class PlannedOrder:
             OrderError: there is no place for the pourer.
             ConfigError: the laboratory's file is invalid.
         """
-        pourer, receiver = (vessel_from(Document.parse(json.dumps(vessel), Path("vessel.json")))
-                            for vessel in (order.pourer, order.vessel))  # fmt: skip
+        pourer, receiver = (vessel_from(Document.of(vessel, folder / ORDER)) for vessel in (order.pourer, order.vessel))
         liquid = liquid_of(order.liquid, order.properties, round(order.load, 9))
         action = _action(order.action, _USUAL) if "x_offset" in order.action else _placed(
             Scene(POUR, pourer, receiver, liquid), order)  # fmt: skip
@@ -253,14 +307,14 @@ class PlannedOrder:
         record = {
             "name": POUR,
             "seed": order.seed,
-            "laboratory": laboratory_record(rig.source or shipped(VIRTUAL)),
+            "laboratory": str(rig.source or shipped(VIRTUAL)),
             "pourer": order.pourer,
             "receiver": order.vessel,
             "motion": motion,
             **_poured_sections(order, liquid, carried=bool(carried_cup(order, rig.spec))),
             "outputs": {"recording": False, "figures": False},
         }
-        plan = campaign_from(Document.parse(json.dumps(record), folder / ORDER))
+        plan = campaign_from(Document.of(record, folder / ORDER))
         if plan.dispense is not None:
             # `OrderBook.settle` enters the outcome in the account of both vessels, once
             plan = replace(plan, dispense=replace(plan.dispense, laboratory=""))
@@ -304,42 +358,37 @@ class PlannedOrder:
         bench = laboratory.bench
         return motion.duration + (0.0 if bench is None else bench.operator_time + bench.balance.settling_time)
 
-    async def predict(self, simulators: Callable[[], SimulatorPool]) -> dict[str, Any]:
+    async def predict(self, simulators: Callable[[], SimulatorPool]) -> PredictionOut:
         """Predict the pour; nothing moves.
 
         Args:
             simulators: opens the simulators, which only an action needs.
-
-        Returns:
-            'amount_g', 'interval_g' (90 %), 'spilled_g', 'duration_s', and for an amount 'error_g',
-            'error_interval_g', 'reachable_tolerance_g' (half of the 90 % interval of the dose as weighed with this
-            balance), 'enough' (probability that the source holds it) and 'ends'.
 
         Raises:
             InvalidActionError: the pour can't be made.
         """
         if self.target is not None:
             return await asyncio.to_thread(self._forecast)
-        return {**await self._simulated(simulators()), "duration_s": self.duration()}
+        return await self._simulated(simulators())
 
-    def _forecast(self) -> dict[str, Any]:
+    def _forecast(self) -> PredictionOut:
         assert self.target is not None
         forecast = predicted_dose(self.plan.laboratory, self.scene, self.target, self.order.seed)
         wanted = self.target.amount
         bench = self.plan.laboratory.bench
         low, high = (1e3 * value for value in forecast.interval)
-        return {
-            "amount_g": 1e3 * forecast.amount,
-            "interval_g": [low, high],
-            "error_g": 1e3 * (forecast.amount - wanted),
-            "error_interval_g": [low - 1e3 * wanted, high - 1e3 * wanted],
-            "duration_s": forecast.duration + (0.0 if bench is None else bench.operator_time),
-            "reachable_tolerance_g": 1e3 * forecast.reachable,
-            "enough": forecast.enough,
-            "ends": {str(end): count for end, count in forecast.ends.items()},
-        }
+        return PredictionOut(
+            amount_g=1e3 * forecast.amount,
+            interval_g=(low, high),
+            error_g=1e3 * (forecast.amount - wanted),
+            error_interval_g=(low - 1e3 * wanted, high - 1e3 * wanted),
+            duration_s=forecast.duration + (0.0 if bench is None else bench.operator_time),
+            reachable_tolerance_g=1e3 * forecast.reachable,
+            enough=forecast.enough,
+            ends={str(end): count for end, count in forecast.ends.items()},
+        )
 
-    async def _simulated(self, pool: SimulatorPool) -> dict[str, Any]:
+    async def _simulated(self, pool: SimulatorPool) -> PredictionOut:
         costing = Costing(Loss(), self.scene, self.plan.parameters)
         strategy = RepeatedSimulation(costing, self.action, SEEDS, self.order.seed)
         requests = strategy.ask(Slots(SEEDS + 1, 0))
@@ -354,16 +403,17 @@ class PlannedOrder:
         load = 1e3 * self.scene.liquid.mass
         poured, spilled = result.over_seeds.get("poured"), result.over_seeds.get("spilled")
         if poured is None or spilled is None:
-            return {"simulations": 0, "simulations_lost": result.simulations_lost}
+            return PredictionOut(simulations=0, simulations_lost=result.simulations_lost, duration_s=self.duration())
         amount = load * (poured.mean - spilled.mean)
         spread = math.hypot(poured.deviation or 0.0, spilled.deviation or 0.0) * math.sqrt(1.0 + 1.0 / SEEDS)
         half = INTERVAL * load * spread
-        return {
-            "amount_g": amount,
-            "interval_g": [max(amount - half, 0.0), min(amount + half, load)],
-            "spilled_g": load * spilled.mean,
-            "simulations": result.simulations,
-        }
+        return PredictionOut(
+            amount_g=amount,
+            interval_g=(max(amount - half, 0.0), min(amount + half, load)),
+            spilled_g=load * spilled.mean,
+            simulations=result.simulations,
+            duration_s=self.duration(),
+        )
 
 
 def _poured_sections(order: PourOrder, liquid: Liquid, *, carried: bool) -> dict[str, Any]:
@@ -420,11 +470,12 @@ def weighing_deviation(laboratory: LaboratorySettings) -> float:
     return math.hypot(repeatability, step / math.sqrt(12.0))
 
 
-def weighed_result(order: PourOrder, measured: PourMeasurement, deviation: float) -> dict[str, Any]:
-    """Return the result of a weighed pour, ready for JSON.
+def _weighed(order: PourOrder, pour: RunPour, measured: PourMeasurement, deviation: float) -> WeighedOut:
+    """Return the result of a weighed pour.
 
     Args:
         order: of the pour.
+        pour: as its journal records it.
         measured: its weights.
         deviation: of one weighing [kg]; a mass is the difference of two.
     """
@@ -432,19 +483,20 @@ def weighed_result(order: PourOrder, measured: PourMeasurement, deviation: float
     masses = weighed_masses(measured)
     received = masses.delivered_g or 0.0
     half = INTERVAL * 1e3 * float(about.get("deviation", math.sqrt(2.0) * deviation))
-    result: dict[str, Any] = {
-        "received_g": received,
-        "received_interval_g": [received - half, received + half],
-        "spilled_g": masses.spilled_g,
-        "left_in_source_g": masses.retained_g,
-        "end": str(about.get("end", "")),
-        "duration_s": about.get("duration"),
-    }
-    if order.amount is not None:
-        error = received - 1e3 * order.amount
-        result["error_g"], result["error_interval_g"] = error, [error - half, error + half]
-        result["within_tolerance"] = abs(error) <= 1e3 * order.tolerance
-    return result
+    error = None if order.amount is None else received - 1e3 * order.amount
+    return WeighedOut(
+        state="weighed",
+        received_g=received,
+        received_interval_g=(received - half, received + half),
+        spilled_g=masses.spilled_g,
+        left_in_source_g=masses.retained_g,
+        error_g=error,
+        error_interval_g=None if error is None else (error - half, error + half),
+        within_tolerance=None if error is None else abs(error) <= 1e3 * order.tolerance,
+        end=str(about.get("end", "")),
+        duration_s=about.get("duration"),
+        seconds=pour.seconds,
+    )
 
 
 @dataclass(frozen=True)
@@ -478,6 +530,19 @@ def settled_pour(run: Path, snapshot: Path, rig: Rig) -> SettledOrder | None:
     )
 
 
+class PlacedOrder(BaseModel):
+    """An order in the daemon's store."""
+
+    id: str
+    campaign: str
+    body: Json[dict[str, Any]]
+    source: str
+    receiver: str
+    amount: float | None
+    predicted: Json[PredictionOut] | None
+    result: Json[WeighedOut] | None
+
+
 class OrderBook:
     """Orders and results in the daemon's store.
 
@@ -488,15 +553,15 @@ class OrderBook:
     def __init__(self, store: Store) -> None:
         self._store, self._materials = store, Materials(store)
 
-    def find(self, key: str) -> dict[str, Any] | None:
-        """Return the row of an order by the caller's id, with JSON decoded; None if there is none."""
+    def find(self, key: str) -> PlacedOrder | None:
+        """Return an order by the caller's id; None if there is none."""
         rows = self._store.rows("select * from pour_order where id = ?", key)
-        return _decoded(rows[0]) if rows else None
+        return PlacedOrder(**rows[0]) if rows else None
 
-    def of_campaign(self, campaign: str) -> dict[str, Any] | None:
-        """Return the row of the order that a queued campaign pours."""
+    def of_campaign(self, campaign: str) -> PlacedOrder | None:
+        """Return the order that a queued campaign pours; None if it is none."""
         rows = self._store.rows("select * from pour_order where campaign = ?", campaign)
-        return _decoded(rows[0]) if rows else None
+        return PlacedOrder(**rows[0]) if rows else None
 
     def begun(self) -> tuple[str, ...]:
         """Return the campaigns of orders that have begun and have no result."""
@@ -506,21 +571,18 @@ class OrderBook:
         )
         return tuple(row["campaign"] for row in rows)
 
-    def list(self, limit: int, source: str = "") -> list[dict[str, Any]]:
-        """Return orders, newest first."""
-        where, arguments = ("where source = ?", [source]) if source else ("", [])
-        rows = self._store.rows(f"select * from pour_order {where} order by rowid desc limit ?", *arguments, limit)
-        return [_decoded(row) for row in rows]
+    def ids(self, limit: int, source: str = "") -> list[str]:
+        """Return the callers' ids of orders, newest first; from one source, if it is given."""
+        where = "where ? in ('', source) order by rowid desc limit ?"
+        return [row["id"] for row in self._store.rows(f"select id from pour_order {where}", source, limit)]
 
-    def add(
-        self, order: PourOrder, campaign: str, body: Mapping[str, Any], predicted: Mapping[str, Any] | None
-    ) -> None:
+    def add(self, order: PourOrder, campaign: str, body: Mapping[str, Any], predicted: PredictionOut | None) -> None:
         """Store an order; call it together with `Store.add` of its campaign."""
         self._store.write(
             "insert into pour_order (id, campaign, body, source, receiver, amount, predicted) "
             "values (?, ?, ?, ?, ?, ?, ?)",
             *(order.id, campaign, json.dumps(body), order.source, order.receiver, order.amount),
-            None if predicted is None else json.dumps(predicted),
+            None if predicted is None else predicted.model_dump_json(),
         )
 
     def settle(self, item: QueueItem, settled: SettledOrder | None, *, ended: bool) -> None:
@@ -531,32 +593,24 @@ class OrderBook:
             settled: from its journal, see `settled_pour`; None if nothing was requested.
             ended: whether the campaign does not continue: a pour that has begun remains without outcome.
         """
-        row = self.of_campaign(item.id)
-        if row is None or row["result"] is not None or settled is None:
+        placed = self.of_campaign(item.id)
+        if placed is None or placed.result is not None or settled is None:
             return
         order, pour, deviation = settled.order, settled.pour, settled.deviation
         if pour.measured is not None:
-            result = {"state": "weighed", **weighed_result(order, pour.measured, deviation)}
-            received = 1e-3 * result["received_g"]
-            spread = math.sqrt(2.0) * deviation
+            result = _weighed(order, pour, pour.measured, deviation)
+            received, spread = 1e-3 * (result.received_g or 0.0), math.sqrt(2.0) * deviation
             moved: Transfer | None = Transfer((received + pour.measured.spilled, spread), (received, spread))
         elif isinstance(pour.outcome, Failed):
-            result = {"state": "failed", "end": pour.reason}
+            result = WeighedOut(state="failed", end=pour.reason, seconds=pour.seconds)
             # an invalid action was refused before anything moved
             moved = None if pour.outcome.kind == "invalid_action" else Transfer(None, None)
         elif ended and pour.state in ("under way", "unknown"):
-            result = {"state": "unknown", "end": "stopped before an operator reported its outcome"}
+            end = "stopped before an operator reported its outcome"
+            result = WeighedOut(state="unknown", end=end, seconds=pour.seconds)
             moved = Transfer(None, None)
         else:
             return
-        result["seconds"] = pour.seconds
         if moved is not None:
-            self._materials.account.transfer(row["id"], row["source"], row["receiver"], moved, by=item.by)
-        self._store.write("update pour_order set result = ? where campaign = ?", json.dumps(result), item.id)
-
-
-def _decoded(row: dict[str, Any]) -> dict[str, Any]:
-    return {
-        name: json.loads(value) if name in ("body", "predicted", "result") and value is not None else value
-        for name, value in row.items()
-    }
+            self._materials.account.transfer(placed.id, placed.source, placed.receiver, moved, by=item.by)
+        self._store.write("update pour_order set result = ? where campaign = ?", result.model_dump_json(), item.id)

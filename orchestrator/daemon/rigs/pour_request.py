@@ -126,6 +126,12 @@ class RequestModel(JsonModel):
         return {key: value for key, value in data.items() if value is not None} if isinstance(data, dict) else data
 
 
+class ResponseModel(BaseModel):
+    """Base of the models of responses."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+
 class PourIn(RequestModel):
     """One pour: an amount, or an action."""
 

@@ -123,8 +123,8 @@ def test_a_vessel_is_in_the_gripper_while_a_campaign_moves_it_and_unknown_only_a
         materials = Materials(store)
 
         def shown(*running: str) -> tuple[str, bool]:
-            (source,) = materials.everything(running)["sources"]
-            return source["position"], source["in_use"]
+            (source,) = materials.everything(running).sources
+            return source.position, source.in_use
 
         assert shown("night") == ("left", True)
         cell.put("pourer", None, "the arm began to take it from 'left'")
