@@ -383,10 +383,10 @@ async def _open_devices(
             raise LaboratoryError(f"laboratory {spec.name} has places, and no account of what stands where was given")
         places = all_places(spec.places)
         pan = Layout.of(places).balance
-        carrier = VesselCarrier(pan.name, arm, arm_spec, held, balance, record, ground_truth)
+        carrier = VesselCarrier(pan.name, arm, arm_spec, held, balance, balance_spec, record, ground_truth)
         liquids = CellLiquids(record, carrier, pan.tray)
         handling = VesselHandling(places, carrier, liquids, balance_spec, supply, ground_truth, tell)
-        doses = DoseHandling(places, spec.vessels, carrier, liquids, record, balance_spec, supply, ground_truth)
+        doses = DoseHandling(places, spec.vessels, carrier, liquids, record, supply, ground_truth)
     setup = Setup(
         spec.mode,
         arm_spec,

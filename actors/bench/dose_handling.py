@@ -24,8 +24,7 @@ from dataclasses import dataclass, replace
 from actors.arm.arm_interface import PlannedPour
 from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.arm.pour_feasibility import vessel as built
-from actors.balance.balance_settings import BalanceSettings
-from actors.balance.weighing_plan import SURE, Weighing, weighing_uncertainty
+from actors.balance.weighing_plan import SURE, Weighing
 from actors.bench.cell_liquids import RESERVOIR, CellLiquids
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.liquid_supply import LiquidSupply
@@ -37,9 +36,8 @@ from actors.bench.vessel_carrying import (
     check_carrying,
     check_pour_path,
     label,
-    move_question,
 )
-from actors.bench.vessel_handling import WRONG, plan_emptying
+from actors.bench.vessel_handling import plan_emptying
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import source_of
 from actors.grippers.gripper_interface import GripperSettings
@@ -220,7 +218,6 @@ class DoseHandling:
         carrier: the arm with its gripper.
         liquids: contents of the cell.
         record: the account of vessels.
-        weighing: settings of the balance.
         supply: has the refill device, if there is one.
         truth: of the bench.
 
@@ -235,13 +232,12 @@ class DoseHandling:
         carrier: VesselCarrier,
         liquids: CellLiquids,
         record: PlaceRecord,
-        weighing: BalanceSettings,
         supply: LiquidSupply | None,
         truth: GroundTruth,
     ) -> None:
         self._places, self._given = tuple(places), tuple(vessels)
         self._carrier, self._liquids, self._record = carrier, liquids, record
-        self._weighing, self._supply, self._truth = weighing, supply, truth
+        self._supply, self._truth = supply, truth
         self._pan = next(place for place in places if place.use == "balance").name
         self._vessels: dict[str, CellVessel] = {}
         self._checked: tuple[ArmSettings, tuple[CellVessel, ...]] | None = None
@@ -503,7 +499,7 @@ class DoseHandling:
                 begin = len(readings())
                 await carrier.move(cup, self._pan, consent)
                 self.placed = _step(readings()[begin:], 0.5 * self._loads[cup].empty_mass)
-            tare = stayed[1] if stayed is not None and stayed[0] == cup else await self._weigh()
+            tare = stayed[1] if stayed is not None and stayed[0] == cup else await carrier.weigh()
             missing = await self._closed(cup, tare, source, consent)
             self._tare = _Tare(tare, self._record.held(cup) or (0.0, 0.0), missing)
             await carrier.take(source, consent)
@@ -514,14 +510,8 @@ class DoseHandling:
         held, empty = self._record.held(cup), self._record.composition(cup).get("", (None, 0.0))
         content, spread = held or (0.0, 0.0)
         if empty[0] is None:  # its own mass is not known yet
-            stated = self._loads[cup].empty_mass
-            if content == 0.0 and abs(gross.mass - stated) > WRONG:
-                text = (
-                    f"The empty cup '{cup}' on the balance weighs {1e3 * gross.mass:.1f} g, and its file states "
-                    f"{1e3 * stated:.1f} g. Is it the right one, empty and dry?"
-                )
-                await self._go_on(text, stated - gross.mass, source, consent)
             if content == 0.0:
+                await self._carrier.check_empty(cup, gross, f"take {label(source)}", consent)
                 self._record.add_component(cup, "", gross.mass, gross.uncertainty)
             return None
         missing = empty[0] + content - gross.mass
@@ -532,18 +522,9 @@ class DoseHandling:
                 f"account of vessels: {1e3 * missing:.2f} ± {1e3 * sigma:.2f} g are missing. Look for spilled liquid, "
                 "and for a wrong cup; leave the vessels where they stand."
             )
-            await self._go_on(text, missing, source, consent)
+            await self._carrier.ask_about_mass(text, {"missing_g": 1e3 * missing}, f"take {label(source)}", consent)
         self._liquids.enter(cup, gross.mass - empty[0], math.hypot(gross.uncertainty, empty[1]), self._mixture(cup))
         return missing
-
-    async def _go_on(self, text: str, missing: float, source: str, consent: MotionConsent) -> None:
-        """Ask a person about masses, and then for the rest of the sequence."""
-        question = OperatorQuestion(
-            f"{text} Shall it go on?", "yes or no", about="mass", details={"missing_g": 1e3 * missing}
-        )
-        if (await self._carrier.ask(question, consent)).strip().lower() not in ("yes", "y"):
-            raise LaboratoryError("the masses are not what they should be, and the operator ended the dose")
-        await consent.given(move_question(f"take {label(source)}"))
 
     def _mixture(self, cup: str) -> str:
         liquids = [name for name, (mass, _) in self._record.composition(cup).items() if name and mass != 0.0]
@@ -601,7 +582,7 @@ class DoseHandling:
         carrier.mass[source] = max(carrier.mass[source] - amount[0], 0.0)
         async with carrier.driving(consent, back):
             await carrier.put(source, self._vessels[source].place)
-            gross = await self._weigh()
+            gross = await carrier.weigh()
             carrier.mass[cup] = content[0] + gross.mass - tare.mass
             spread = math.hypot(content[1], tare.uncertainty, gross.uncertainty)
             self._liquids.enter(cup, carrier.mass[cup], spread, self._mixture(cup))
@@ -622,7 +603,3 @@ class DoseHandling:
             self._lose_moved()
         self._carrier.forget()
         self._tare = self._stayed = None
-
-    async def _weigh(self) -> Weighing:
-        weight = await self._carrier.balance.weigh()
-        return Weighing(weight.mass, weighing_uncertainty(weight.step, self._weighing.deviation))

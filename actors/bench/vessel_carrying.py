@@ -22,6 +22,8 @@ from actors.arm.arm_interface import ArmRefusedError, PlannedPour
 from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.arm.planned_pour import PlaceWay
 from actors.balance.balance_device import DeviceBalance
+from actors.balance.balance_settings import BalanceSettings
+from actors.balance.weighing_plan import Weighing, weighing_uncertainty
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.held_vessel import HeldVessel, grip_limits
 from actors.grippers.gripper_interface import GripperError, GripperSettings
@@ -34,6 +36,9 @@ FILMED = 5e-3
 
 GONE_TIME = 6.0
 """Longest time for the balance to show that a vessel was lifted off it [s of bench time]."""
+
+WRONG = 5e-3
+"""Difference of an empty vessel from the mass that its file states [kg], above which it may be another one."""
 
 SHOWN = 5
 """Largest number of problems of places that one error states."""
@@ -200,6 +205,7 @@ class VesselCarrier:
         spec: of the arm.
         held: the gripper.
         balance: under the receiver.
+        weighing: its settings.
         record: account of what stands where.
         truth: of the bench.
 
@@ -217,11 +223,12 @@ class VesselCarrier:
         spec: ArmSettings,
         held: HeldVessel,
         balance: DeviceBalance,
+        weighing: BalanceSettings,
         record: PlaceRecord,
         truth: GroundTruth,
     ) -> None:
         self.arm, self.spec, self.held, self.balance, self.record = arm, spec, held, balance, record
-        self._on_balance, self._truth = balance_place, truth
+        self._on_balance, self._weighing, self._truth = balance_place, weighing, truth
         self.at: dict[str, str] = {}
         self.mass: dict[str, float] = {}
         self.loads: Mapping[str, Load] = {}
@@ -231,6 +238,41 @@ class VesselCarrier:
         self._away = False
         self._agreed: tuple[str, ...] = ()
         self.asked = False
+
+    # ---- masses
+
+    async def weigh(self) -> Weighing:
+        """Weigh what is on the balance."""
+        weight = await self.balance.weigh()
+        return Weighing(weight.mass, weighing_uncertainty(weight.step, self._weighing.deviation))
+
+    async def check_empty(self, name: str, gross: Weighing, rest: str, consent: MotionConsent) -> None:
+        """Ask a person if an empty vessel on the balance does not weigh what its file states; see `ask_about_mass`."""
+        stated = self.loads[name].empty_mass
+        if abs(gross.mass - stated) <= WRONG:
+            return
+        text = (
+            f"The empty vessel on the balance, {label(name)}, weighs {1e3 * gross.mass:.1f} g, and its file states "
+            f"{1e3 * stated:.1f} g. Is it the right one, empty and dry?"
+        )
+        await self.ask_about_mass(text, {"missing_g": 1e3 * (stated - gross.mass)}, rest, consent)
+
+    async def ask_about_mass(self, text: str, details: dict[str, float], rest: str, consent: MotionConsent) -> None:
+        """Ask a person about masses that do not agree, and then for the rest of the sequence.
+
+        Args:
+            text: the problem.
+            details: numbers of the question.
+            rest: motion that follows.
+            consent: of the pour or dose.
+
+        Raises:
+            LaboratoryError: the answer is not yes.
+        """
+        question = OperatorQuestion(f"{text} Shall it go on?", "yes or no", about="mass", details={**details})
+        if (await self.ask(question, consent)).strip().lower() not in ("yes", "y"):
+            raise LaboratoryError("the masses are not what they should be, and the operator did not continue")
+        await consent.given(move_question(rest))
 
     # ---- where they stand
 

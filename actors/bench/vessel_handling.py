@@ -22,7 +22,7 @@ from actors.arm.arm_interface import PlannedPour
 from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.arm.pour_feasibility import vessel as built
 from actors.balance.balance_settings import BalanceSettings
-from actors.balance.weighing_plan import GRIP, SURE, Weighing, weighing_uncertainty
+from actors.balance.weighing_plan import GRIP, SURE, Weighing
 from actors.bench.cell_liquids import CellLiquids
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.liquid_supply import LiquidSupply
@@ -33,10 +33,9 @@ from actors.bench.vessel_carrying import (
     Ways,
     check_carrying,
     check_pour_path,
-    move_question,
 )
 from actors.grippers.gripper_interface import GripperSettings
-from actors.interfaces import InvalidActionError, LaboratoryError, Notice, OperatorQuestion
+from actors.interfaces import InvalidActionError, Notice, OperatorQuestion
 from actors.places import ROLES, Layout, PlaceSettings
 from sim_engine.action import DEG, Action
 from sim_engine.lip_flow import flow_course
@@ -45,15 +44,13 @@ from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import VesselSpec
 from sim_engine.vessel.vessel import Vessel
 
-WRONG = 5e-3
-"""Difference of an empty vessel from the mass that its file states [kg], above which it may be another one."""
-
 REFILLS = 2
 """Largest number of fillings by the refill device for one pour."""
 
 BACK_SPEED, BACK_ANGLE, BACK_HOLD = 20 * DEG, 135 * DEG, 4.0
 """Pouring back: slow, as far as the arm may tilt, and held until the last drops have left."""
 
+TAKE = "take the pourer"
 SET_UP = "put the pourer down, put the receiver on the balance, and take the pourer"
 CLEAR = "put the pourer down, and take the receiver off the balance"
 WEIGH = "put the pourer on the balance"
@@ -254,7 +251,7 @@ class VesselHandling:
             await self._carrier.take("receiver", consent)
             await self._pour_back(consent, seed)
             self._carrier.mass["receiver"] = 0.0
-            back = await self._weigh()  # while the arm waits for the warning time after its release
+            back = await self._carrier.weigh()  # while the arm waits for the warning time after its release
             await self._carrier.put("receiver", self._layout.rest["receiver"].name)
         self._poured, self._pending = None, (poured, before, back)
         full = await self._topped_up(consent, back, empty, seed)
@@ -289,7 +286,7 @@ class VesselHandling:
                     self._carrier.mass["pourer"] = liquid.mass
                     await self._carrier.move("pourer", self._layout.balance.name, consent)
                 if filled:
-                    problem, before, now = "the refill device has not filled it up", now, await self._weigh()
+                    problem, before, now = "the refill device has not filled it up", now, await self._carrier.weigh()
                     self._liquids.taken(reserve, before, now, liquid.name)
                     continue
             question = OperatorQuestion(
@@ -301,7 +298,7 @@ class VesselHandling:
                 details={"missing_g": 1e3 * missing},
             )
             await self._carrier.ask(question, consent)
-            now, problem = await self._weigh(), "it does not hold what is asked for"
+            now, problem = await self._carrier.weigh(), "it does not hold what is asked for"
 
     @property
     def _refills(self) -> bool:
@@ -364,7 +361,7 @@ class VesselHandling:
         async with self._carrier.driving(consent, SET_UP):
             await self._carrier.move("pourer", stands["pourer"].name, consent)
             await self._carrier.move("receiver", balance, consent)
-            gross = await self._weigh()
+            gross = await self._carrier.weigh()
             await self._account(gross, consent)
             self._dry, self._gross = self._dry or gross, gross
             await self._carrier.take("pourer", consent)
@@ -373,7 +370,7 @@ class VesselHandling:
     async def _account(self, gross: Weighing, consent: MotionConsent) -> None:
         """Compare the masses of a whole cycle; ask a person if they do not close."""
         if self._dry is None:
-            await self._right_vessel(gross, consent)
+            await self._carrier.check_empty("receiver", gross, TAKE, consent)
         else:
             self._cycle["film_g"] = 1e3 * (gross.mass - self._dry.mass)
         if self._pending is None:
@@ -397,35 +394,13 @@ class VesselHandling:
         )
         if abs(missing) <= SURE * sigma:
             return
-        question = OperatorQuestion(
+        text = (
             f"The masses do not close: {1e3 * left:.2f} g left the receiver when it was poured back, and the pourer "
             f"gained {1e3 * gained:.2f} g, {1e3 * missing:.2f} ± {1e3 * sigma:.2f} g less. Look for spilled liquid, "
-            "and for a wrong vessel; leave the vessels where they stand. Shall it go on?",
-            "yes or no",
-            about="mass",
-            details={"missing_g": 1e3 * missing, "uncertainty_g": 1e3 * sigma},
+            "and for a wrong vessel; leave the vessels where they stand."
         )
-        await self._go_on(question, consent)
-
-    async def _right_vessel(self, gross: Weighing, consent: MotionConsent) -> None:
-        """Ask a person if the dry receiver on the balance does not weigh what its file states."""
-        empty = self._carrier.loads["receiver"].empty_mass
-        if abs(gross.mass - empty) <= WRONG:
-            return
-        question = OperatorQuestion(
-            f"The empty receiver on the balance weighs {1e3 * gross.mass:.1f} g, and its file states "
-            f"{1e3 * empty:.1f} g. Is it the right vessel, empty and dry? Shall it go on?",
-            "yes or no",
-            about="mass",
-            details={"missing_g": 1e3 * (empty - gross.mass)},
-        )
-        await self._go_on(question, consent)
-
-    async def _go_on(self, question: OperatorQuestion, consent: MotionConsent) -> None:
-        """Ask a person about masses, and then for the rest of the sequence."""
-        if (await self._carrier.ask(question, consent)).strip().lower() not in ("yes", "y"):
-            raise LaboratoryError("the masses are not what they should be, and the operator ended the cycle")
-        await consent.given(move_question("take the pourer"))
+        details = {"missing_g": 1e3 * missing, "uncertainty_g": 1e3 * sigma}
+        await self._carrier.ask_about_mass(text, details, TAKE, consent)
 
     def poured(self, weighed: Mapping[str, Weighing]) -> None:
         """The pour was weighed: what it poured is in the receiver, and the pourer stands on the balance."""
@@ -453,12 +428,6 @@ class VesselHandling:
         """The cycle was interrupted: the vessels are laid out again before the next pour."""
         self._carrier.forget()
         self._poured = self._pending = None
-
-    # ---- weights
-
-    async def _weigh(self) -> Weighing:
-        weight = await self._carrier.balance.weigh()
-        return Weighing(weight.mass, weighing_uncertainty(weight.step, self._weighing.deviation))
 
     def _enter(self, vessel: str, mass: float | None, deviation: float) -> None:
         assert self._scene is not None
