@@ -24,6 +24,7 @@ from actors.arm_geometry import RobotCell
 from actors.balance.balance_settings import BalanceEmulator, BalanceKind, SerialBalanceSettings
 from actors.balance.serial_port import look_at_port
 from actors.balance.simulated_balance import SimulatedBalanceSettings, VirtualBalance
+from actors.grippers.franka_hand import HandSettings
 from actors.grippers.gripper_interface import GripperEmulator
 from actors.grippers.onrobot_gripper import OnRobotSettings
 from actors.grippers.robotiq_gripper import RobotiqSettings
@@ -227,6 +228,17 @@ class EmulatedOnRobotSettings(OnRobotSettings):
     def start_emulator(self) -> GripperEmulator:
         """See `GripperSettings.start_emulator`."""
         emulator: GripperEmulator = _emulator("onrobot")(self)
+        return emulator
+
+
+class EmulatedHandSettings(HandSettings):
+    """The Hand of a Franka arm."""
+
+    emulated: ClassVar[bool] = True
+
+    def start_emulator(self) -> GripperEmulator:
+        """See `GripperSettings.start_emulator`."""
+        emulator: GripperEmulator = _emulator("franka-hand")(self)
         return emulator
 
 

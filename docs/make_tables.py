@@ -30,6 +30,7 @@ from actors.balance.display_behaviour import DisplayBehaviour
 from actors.balance.scale_model import ScaleSettings
 from actors.dosing_settings import DosingSettings
 from actors.grippers.digital_gripper import DigitalSettings
+from actors.grippers.franka_hand import HandSettings
 from actors.grippers.onrobot_gripper import OnRobotSettings
 from actors.grippers.robotiq_gripper import RobotiqSettings
 from actors.interfaces import OperatorSettings, RaySettings
@@ -103,6 +104,7 @@ SECTIONS: dict[str, type[Settings]] = {
     "unattended": UnattendedSettings,
     "gripper-robotiq": RobotiqSettings,
     "gripper-onrobot": OnRobotSettings,
+    "gripper-franka": HandSettings,
     "gripper-digital": DigitalSettings,
     "pump": SimulatedPumpSettings,
     "source": SourceSettings,
@@ -151,6 +153,7 @@ OF_SECTIONS = {
     "RackSettings": "[rack](places.md#racks)",
     "ContainerSettings": "[container](places.md#waste)",
     "UnattendedSettings": "[unattended](places.md#settings)",
+    "EmulatedHandSettings": "[gripper](grippers.md)",
     "EmulatedOnRobotSettings": "[gripper](grippers.md)",
     "EmulatedRobotiqSettings": "[gripper](grippers.md)",
     "SpillSensorSettings": "[spill sensor](#spill-sensor)",
