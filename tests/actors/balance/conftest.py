@@ -45,12 +45,10 @@ def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSetting
 
 @pytest.fixture(scope="session")
 def voices() -> Iterator[Callable[..., VirtualSerialBalance]]:
-    """One virtual balance of each voice, started when first asked for; `anew` replaces it."""
+    """One virtual balance of each voice, started when first asked for."""
     started: dict[tuple[str, bool], VirtualSerialBalance] = {}
 
-    def of(voice: str, tcp: bool = False, *, anew: bool = False) -> VirtualSerialBalance:
-        if anew and (voice, tcp) in started:
-            started.pop((voice, tcp)).close()
+    def of(voice: str, tcp: bool = False) -> VirtualSerialBalance:
         if (voice, tcp) not in started:
             started[voice, tcp] = VirtualSerialBalance.start(
                 voice, baud=0, scale=ScaleSettings(settling_time=0.4), time_scale=PACE, latency=0.001, tcp=tcp
@@ -64,14 +62,13 @@ def voices() -> Iterator[Callable[..., VirtualSerialBalance]]:
 
 @pytest.fixture
 def virtual(
-    voices: Callable[..., VirtualSerialBalance], request: pytest.FixtureRequest
+    voices: Callable[..., VirtualSerialBalance],
 ) -> Iterator[Callable[..., VirtualSerialBalance]]:
     """An empty, healthy virtual balance of a voice, on a serial line or over TCP."""
     used: list[VirtualSerialBalance] = []
-    tried_again = getattr(request.node, "execution_count", 1) > 1
 
     def of(voice: str, tcp: bool = False) -> VirtualSerialBalance:
-        balance = voices(voice, tcp, anew=tried_again)
+        balance = voices(voice, tcp)
         used.append(balance)
         balance.plug()
         balance.faults(**asdict(BalanceFaults()))
