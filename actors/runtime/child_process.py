@@ -176,6 +176,17 @@ class ChildProcess:
         return self.status is None
 
     @property
+    def cpu_time(self) -> float:
+        """Processor time that it has used [s]; 0 once it has ended."""
+        import psutil  # type: ignore[import-untyped,unused-ignore]
+
+        try:
+            used = psutil.Process(self.pid).cpu_times()
+        except psutil.Error:
+            return 0.0
+        return float(used.user + used.system)
+
+    @property
     def errors_kept(self) -> str:
         """The end of its standard error, and of its output if that is no pipe. Empty unless `errors` is 'kept'."""
         if self._errors is None:

@@ -519,7 +519,7 @@ def _is_cut_off(membership: Any) -> bool:
 
 @contextlib.contextmanager
 def _ray_internals(*, helpers: bool) -> Iterator[None]:
-    """Context for `ray.init`: the only place that uses Ray's private API, for two things that its public API lacks.
+    """Context for `ray.init`: the only place that uses Ray's private API, for three things that its public API lacks.
 
     - Ray reads most of its environment variables when it is imported. If the user's program has imported it before,
       or this process has used another Ray, Ray must read them again.
@@ -527,11 +527,14 @@ def _ray_internals(*, helpers: bool) -> Iterator[None]:
       need 90 MB and seconds of Ray's start each; the third keeps up to 200 logs open. `include_dashboard=False`
       still starts the server, with fewer functions. The other two have options only in `ray start`, which would
       need another process.
+    - A private Ray that has not registered its node within 30 s has failed, without a setting: a busy machine needs
+      longer. Here it has failed if its process has ended, or at `START_DEADLINE`.
 
     Args:
-        helpers: whether to start the three processes.
+        helpers: whether to start the three processes; True for a cluster that others have started.
     """
     was_imported = "ray" in sys.modules
+    from ray._private import services
     from ray._private.node import Node
     from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore[attr-defined]
 
@@ -542,8 +545,29 @@ def _ray_internals(*, helpers: bool) -> Iterator[None]:
     before = {name: getattr(Node, name) for name in left_out if hasattr(Node, name)}
     for name in before:
         setattr(Node, name, lambda node, **settings: None)
+    get_node = services.get_node
+
+    def registered(*of: Any) -> Any:
+        end = time.monotonic() + START_DEADLINE
+        while True:
+            try:
+                return get_node(*of)
+            except RuntimeError:
+                if helpers or time.monotonic() > end or not _raylet_runs():
+                    raise
+            time.sleep(0.2)
+
+    services.get_node = registered
     try:
         yield
     finally:
+        services.get_node = get_node
         for name, method in before.items():
             setattr(Node, name, method)
+
+
+def _raylet_runs() -> bool:
+    """Whether the node process of a private Ray that this process starts is running."""
+    import psutil
+
+    return any(child.name() == "raylet" and _runs(child) for child in psutil.Process().children())

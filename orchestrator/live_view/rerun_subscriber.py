@@ -105,7 +105,7 @@ class QueueThread(Generic[Item]):
                     self._name,
                     type(error).__name__,
                     error,
-                    exc_info=error,
+                    exc_info=None if isinstance(error, OSError) else error,
                 )
 
 
@@ -113,7 +113,7 @@ CAPACITY = 4_000
 """Largest number of waiting events: minutes of a busy campaign."""
 
 CLOSE_TIMEOUT = 30.0
-"""Longest time to wait until the recording is complete [s]."""
+"""Longest time to wait until the recording is complete while its process does nothing [s]: a disk may hang."""
 
 
 class RerunMonitor:
@@ -142,6 +142,7 @@ class RerunMonitor:
         # The writer could report this only after the start of the campaign.
         self.path.open("wb").close()
         self._process = _start_writer()
+        self._given_up = False
         self._report: dict[str, Any] = {"failed": 0}
         self._reported = 0
         self._worker: QueueThread[Event | Opening] = QueueThread(
@@ -170,9 +171,20 @@ class RerunMonitor:
         return self._worker.failed + int(self._report["failed"])
 
     def close(self, timeout: float = CLOSE_TIMEOUT) -> bool:
-        """Write waiting events; return False if the file could not be completed within `timeout` [s]. Never raises."""
-        if not self._worker.close(timeout):
-            _log.warning("recording %s: could not be completed within %g s", self.path.name, timeout)
+        """Write waiting events; return False if the file could not be completed. Never raises.
+
+        Args:
+            timeout: longest time without progress of the process that writes, which a busy machine makes slow [s].
+        """
+        used = 0.0
+        while not self._worker.close(timeout):
+            if (now := self._process.cpu_time) <= used:
+                self._given_up = True
+                _log.warning(
+                    "recording %s: could not be completed: nothing was written in %g s", self.path.name, timeout
+                )
+                break
+            used = now
         self._process.kill()  # finished, or beyond recovery
         self._worker.close(1.0)
         return self._report.get("complete", False) is True
@@ -189,6 +201,8 @@ class RerunMonitor:
         try:
             line = self._process.read_line()
         except EOFError:
+            if self._given_up:
+                return
             raise ChildProcessError(
                 f"the process that writes {self.path} has died; what it had written is kept"
             ) from None

@@ -13,6 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from actors.runtime import ray_runtime
 from tests.reliability import strikes
 from tests.support.waiting import alive, wait_for
 
@@ -113,3 +114,26 @@ def test_whoever_asks_simulators_or_optimiser_is_told_what_ray_has_lost(whose: s
     assert "Ray on this machine has lost its" in optimiser
     assert closing == "closing"
     assert lost in said or whose == "kept"
+
+
+@pytest.mark.parametrize("runs", [True, False])
+def test_a_start_of_ray_waits_as_long_as_its_process_runs(monkeypatch: pytest.MonkeyPatch, runs: bool) -> None:
+    """Ray itself gives its node 30 s: beside twenty busy processes that was too little."""
+    from ray._private import services
+
+    answers: list[dict[str, str] | None] = [None, None, {"node": "registered"}]
+
+    def get_node(address: str, node: str) -> dict[str, str]:
+        if (answer := answers.pop(0)) is None:
+            raise RuntimeError("not registered yet")
+        return answer
+
+    monkeypatch.setattr(services, "get_node", get_node)
+    monkeypatch.setattr(ray_runtime, "_raylet_runs", lambda: runs)
+    with ray_runtime._ray_internals(helpers=False):
+        if runs:
+            assert services.get_node("", "") == {"node": "registered"}
+        else:
+            with pytest.raises(RuntimeError, match="not registered yet"):
+                services.get_node("", "")
+    assert services.get_node is get_node

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +21,7 @@ from actors.arm.arm_settings import arm_kind
 from actors.interfaces import PourProgress
 from actors.optimizer.questions import Data, MinimumQuery
 from actors.optimizer.suggest import propose, slices
-from actors.runtime.child_process import child_environment
+from actors.runtime.child_process import ChildProcess, child_environment
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.learning.requests import Pour, Simulate, Simulated, Suggest, Suggested
 from orchestrator.live_view.blueprints import Moment, campaign_blueprint
@@ -345,6 +348,20 @@ def test_an_event_that_cannot_be_drawn_costs_only_itself(tmp_path: Path) -> None
     assert monitor.close(timeout=PATIENCE)
     assert monitor.failed == 1
     assert Contents(monitor.path).rows("/learning/narrow_cup/loss/measured") == 3
+
+
+def test_a_recording_is_completed_while_its_process_works_however_slow_the_machine(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """On a busy machine the process that writes needed longer than the time after which it was ended."""
+    with pytest.MonkeyPatch.context() as busy:
+        busy.setattr(ChildProcess, "cpu_time", property(lambda process: time.monotonic()))
+        assert RerunMonitor(tmp_path / "campaign.rrd", example_run.campaign()).close(timeout=0.05)
+    os.kill((hung := RerunMonitor(tmp_path / "hung.rrd", example_run.campaign())).pid, signal.SIGSTOP)
+    assert not hung.close(timeout=0.2), "it does nothing"
+    assert [record.getMessage() for record in caplog.records] == [
+        "recording hung.rrd: could not be completed: nothing was written in 0.2 s"
+    ]
 
 
 def test_slow_disk_drops_and_counts_events_and_never_holds_up_the_campaign() -> None:
