@@ -2,10 +2,11 @@
 
 - `check_campaign` and `check_vessels` build the vessels and try actions. Vessels must be valid solids, hold the liquid
   and not touch; the arm must be able to make some action.
+- One dose out of each vessel that is no straight cup is simulated (`orchestrator.campaigns.dose_flows`).
 - `senseless` finds settings that can run but waste pours: streams that miss the receiver (range of a free jet), and
   tilt speeds that the arm refuses.
 
-No pour and no simulation is made.
+Nothing is poured, and nothing else is simulated.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from actors.grippers.gripper_interface import GripperSettings
 from actors.interfaces import DoseTarget, InvalidActionError, LaboratoryError, UnreachablePlaceError
 from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from actors.places import CellVessel, PlaceSettings, all_places
+from orchestrator.campaigns.dose_flows import dose_flows
 from orchestrator.campaigns.yaml.file_access import why_not_writable
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.campaigns.yaml.yaml_source import Document, Loc
@@ -35,6 +37,7 @@ from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.collision import contact_during, describe_contact
 from sim_engine.hydrostatics import level, retained_volume
 from sim_engine.lip_flow import flow_course
+from sim_engine.liquids import SimulationParameters
 from sim_engine.motion import plan_motion
 from sim_engine.scene import MIRRORED_FROM, Scene
 from sim_engine.search_space import Axis, Space
@@ -54,6 +57,10 @@ MOST_TRIED = 9
 
 DOSE_TILTS = Space((Axis("angular_velocity", math.radians(5.0), math.radians(40.0)),))
 """Speeds of the tilt within which most of a dose flows."""
+
+FULLEST, ASKEW = 0.97, 2.0 * SimulationParameters.info()["tilt_zero"].tolerance
+"""Largest share of what a source of doses holds at rest, if it is held askew by twice the tolerance of the grip [rad].
+Its surface is not at rest when it is carried and begins to turn."""
 
 Senseless = tuple[tuple[Loc, ...], str]
 """Keys that the finding may concern, the most specific first, and the message."""
@@ -491,14 +498,16 @@ class _Checker:
                 self.add(role.places(*missed[0]), f"{role.text}: {missed[1]}")
             smallest = min((planned.amount for planned in doses), default=math.inf)
             self._dosable(scene, vessels[0], (smallest, largest), role, laboratory.bench)
-            if self.arm is not None:
-                if not arm_kind(self.arm).doses:
-                    self.add(role.places(), f"an arm of the kind '{self.arm.kind}' can't pour wanted amounts")
-                    continue
-                try:
-                    path_of(scene, scene.action({}), self.arm)
-                except InvalidActionError as error:
-                    self.add(role.places(("motion",)), f"{role.text}: the arm can't make the tilt: {error}")
+            if self.arm is not None and not arm_kind(self.arm).doses:
+                self.add(role.places(), f"an arm of the kind '{self.arm.kind}' can't pour wanted amounts")
+                continue
+            try:
+                path_of(scene, scene.action({}), self.arm)
+            except InvalidActionError as error:
+                unable = (
+                    "it can't be poured from at this placement" if self.arm is None else "the arm can't make the tilt"
+                )
+                self.add(role.places(("motion",)), f"{role.text}: {unable}: {error}")
         if plan.mixtures is not None:
             return  # whose amounts are compared with their own sources when they are read
         full = min(scene.liquid.mass for scene in plan.scenes)
@@ -519,6 +528,14 @@ class _Checker:
         from actors.dosing.simulated_dose import check_straight
 
         source = role.places(("sources",), ("pourer",))
+        most = FULLEST * scene.liquid.density * retained_volume(pourer, ASKEW)
+        if scene.liquid.mass > most:
+            self.add(
+                role.places(("liquid", "mass"), ("liquid",), ("liquids",)),
+                f"{role.text}: '{pourer.name}' is too full to be tilted with {1e3 * scene.liquid.mass:.4g} g of "
+                f"{scene.liquid.name}, and holds {1e3 * scene.liquid.density * pourer.capacity:.4g} g to the brim: "
+                f"fill it with {1e3 * most:.4g} g at most",
+            )
         kept = scene.liquid.density * retained_volume(pourer, LARGEST_TILT)
         if scene.liquid.mass - kept < amounts[1]:
             self.add(
@@ -712,6 +729,13 @@ def _check_doses(plan: CampaignPlan, dispense: DispensePlan, checker: _Checker, 
     checker.display(dispense, laboratory)
     if dispense.mixtures is not None and len(checker.problems) == before:
         checker.mixtures(plan, tell)
+    if len(checker.problems) == before:
+        for flow in dose_flows(plan, checker.doing):
+            places = (*_dosed(dispense, flow.scene.pourer.name), dose_section(dispense))
+            for text in flow.warnings():
+                checker.warn(checker.problem(places, text))
+            if (misses := flow.misses()) is not None:
+                checker.add((("motion", "x_offset"), ("motion",), *places), misses)
 
 
 def _dosed(plan: DispensePlan, vessel: str) -> tuple[Loc, ...]:

@@ -152,10 +152,35 @@ def _predict(plan: CampaignPlan) -> None:
         strategy.assume(source.name, KnownSource(mass=left, deviation=deviation))
         total, filled = total + forecast.duration, filled + source.fill
         print(forecast_text(planned, source, forecast))
+    show_flows(plan)
     if len(series.doses) > 1:
         times = "once" if filled == 1 else f"{filled} times"
         print(f"{len(series.doses)} doses: {total:.0f} s of pouring and weighing; sources filled {times}")
     print_message("nothing was poured")
+
+
+def show_flows(plan: CampaignPlan) -> None:
+    """Print and draw the flow of each source of a campaign's doses that is no straight cup, simulated once.
+
+    Args:
+        plan: of a campaign that was checked.
+
+    Raises:
+        RefusalError: a picture can't be written (exit code 1).
+    """
+    from orchestrator.campaigns.dose_flows import dose_flows
+    from orchestrator.reports import figure_style
+    from orchestrator.reports.run_figures import draw_flow
+
+    for flow in dose_flows(plan):
+        if flow.comparison is None:
+            continue  # which the checks have reported
+        name = figure_style.safe_name(
+            f"{plan.name}-{flow.scene.pourer.name}-{flow.scene.liquid.name}-into-{flow.scene.receiver.name}"
+        )
+        with Refused(OSError, code=FAILED):
+            picture = figure_style.save(draw_flow(flow), plan.outputs.folder / f"{name}-flow.png")
+        print_note(f"{flow.text()}; picture: {picture}")
 
 
 def forecast_text(planned: PlannedDose, source: DoseSource, predicted: DoseForecast) -> str:

@@ -86,6 +86,7 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             return f"daemon, rigs: {', '.join(rig.name for rig in load_settings(path).rigs)}", []
         case _:
             from orchestrator.campaigns.campaign_checks import check_campaign
+            from orchestrator.cli.dose_command import show_flows
 
             plan = load_campaign(path, posteriors=_posteriors)
             for line in () if plan.memory is None else plan.memory.lines:
@@ -96,6 +97,8 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             )
             for text in dict.fromkeys(warned):
                 print_warning(text)
+            if not problems:
+                show_flows(plan)
             return f"campaign, seed {plan.seed}", [str(problem) for problem in problems]
 
 

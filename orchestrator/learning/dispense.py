@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Literal
 
+from pydantic import Field
+
 from actors.dosing.dose_series import NINETY_PERCENT
 from actors.interfaces import DoseKnowledge, DoseSource, DoseTarget
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
@@ -60,16 +62,22 @@ class SourcesRead(StageResult):
     sources: dict[str, KnownSource]
     """By name; sources of unknown content are absent."""
 
+    simulated: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """What a simulated dose says about sources before their first dose, by name: fields of `DoseKnowledge`."""
+
 
 class ReadSources:
     """Keeps the content of the sources as a result; it makes no request.
 
     Args:
         sources: by name.
+        simulated: what a simulated dose says about sources, by name.
     """
 
-    def __init__(self, sources: Mapping[str, KnownSource]) -> None:
-        self._sources = dict(sources)
+    def __init__(
+        self, sources: Mapping[str, KnownSource], simulated: Mapping[str, DoseKnowledge] | None = None
+    ) -> None:
+        self._sources, self._simulated = dict(sources), dict(simulated or {})
         self.decisions: list[Decision] = []
 
     @property
@@ -91,7 +99,9 @@ class ReadSources:
 
     def result(self) -> SourcesRead:
         """The content of the sources."""
-        return SourcesRead(sources=self._sources)
+        return SourcesRead(
+            sources=self._sources, simulated={name: _fields(shown) for name, shown in self._simulated.items()}
+        )
 
 
 class DoseSignals(ResultPart):
@@ -384,7 +394,8 @@ class Dispense:
         plan: sources, amounts and their order.
         seed: seed of a virtual bench's random numbers.
         known: content of the sources; one that is absent is filled before its first dose.
-        calibrated: what a calibration has shown of sources, by name; it counts until the first dose of each.
+        expected: what a calibration or a simulated dose has shown of sources, by name; it counts until the first dose
+            of each.
     """
 
     def __init__(
@@ -392,9 +403,9 @@ class Dispense:
         plan: DispensePlan,
         seed: int,
         known: Mapping[str, KnownSource] | None = None,
-        calibrated: Mapping[str, DoseKnowledge] | None = None,
+        expected: Mapping[str, DoseKnowledge] | None = None,
     ) -> None:
-        self._plan, self._calibrated = plan, dict(calibrated or {})
+        self._plan, self._expected = plan, dict(expected or {})
         self._seeds = SeedStream(seed, "dispense")
         self._constants = self._seeds.next()
         self._sources: dict[str, KnownSource] = dict(known or {})
@@ -435,7 +446,7 @@ class Dispense:
         text = f"dose {number}/{self._count}: {1e3 * planned.amount:g} g{into} from {source.name}{filled}"
         if source.knowledge is not None and source.unused:
             mean, deviation = source.knowledge.onset_flow[0], math.sqrt(source.knowledge.covariance[0])
-            text += f"; onset from the calibration: {math.degrees(mean):+.1f}° ± {math.degrees(deviation):.1f}°"
+            text += f"; expected onset: {math.degrees(mean):+.1f}° ± {math.degrees(deviation):.1f}°"
         self.decisions.append(Decision(text))
         return [self._pouring]
 
@@ -467,7 +478,7 @@ class Dispense:
         return sure > planned.amount + planned.limit and content.mass - planned.amount >= self._plan.refill_below
 
     def _source(self, name: str, content: KnownSource, *, fill: bool) -> DoseSource:
-        knowledge = self._calibrated.get(name) if content.knowledge is None else _knowledge(content.knowledge)
+        knowledge = self._expected.get(name) if content.knowledge is None else knowledge_of(content.knowledge)
         return DoseSource(name, content.mass, content.deviation, fill, self._constants, knowledge)
 
     def take(self, pour: Pour, outcome: Outcome | None) -> None:
@@ -568,7 +579,8 @@ def _fields(knowledge: DoseKnowledge) -> dict[str, Any]:
     return {name: getattr(knowledge, name) for name in DoseKnowledge.__dataclass_fields__}
 
 
-def _knowledge(fields: Mapping[str, Any]) -> DoseKnowledge:
+def knowledge_of(fields: Mapping[str, Any]) -> DoseKnowledge:
+    """Knowledge about a source, from its fields."""
     lag = fields["lag"]
     return DoseKnowledge(
         tuple(fields["onset_flow"]),

@@ -78,7 +78,7 @@ class Mix(Dispense):
 
     Args:
         plan: with mixtures.
-        seed, known, calibrated: see `Dispense`.
+        seed, known, expected: see `Dispense`.
     """
 
     def __init__(
@@ -86,9 +86,9 @@ class Mix(Dispense):
         plan: DispensePlan,
         seed: int,
         known: Mapping[str, KnownSource] | None = None,
-        calibrated: Mapping[str, DoseKnowledge] | None = None,
+        expected: Mapping[str, DoseKnowledge] | None = None,
     ) -> None:
-        super().__init__(plan, seed, known, calibrated)
+        super().__init__(plan, seed, known, expected)
         assert plan.mixtures is not None
         self._mixtures = plan.mixtures
         self._spares = list(plan.mixtures.spares)
@@ -340,11 +340,11 @@ def dose_strategy(
     plan: DispensePlan,
     seed: int,
     known: Mapping[str, KnownSource] | None = None,
-    calibrated: Mapping[str, DoseKnowledge] | None = None,
+    expected: Mapping[str, DoseKnowledge] | None = None,
 ) -> Dispense:
     """The strategy of a series of doses; see `Dispense`."""
     kind = Dispense if plan.mixtures is None else Mix
-    return kind(plan, seed, known, calibrated)
+    return kind(plan, seed, known, expected)
 
 
 def _cup(position: str, doses: Mapping[str, PlannedDose], replaces: str = "") -> MixedCup:

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from orchestrator.campaigns.dose_flows import DoseFlow
 from orchestrator.learning.calibration.calibration_base import Calibrated
 from orchestrator.learning.calibration.calibration_scores import UNCALIBRATED, Scores
 from orchestrator.learning.campaign_plan import CampaignPlan, receiver_name
@@ -333,6 +335,44 @@ def draw_dose(dose: Dose) -> Figure:
     axes[1].plot(signals.times, signals.tilt_deg, color=style.POURER)
     style.dress(axes[0], y="balance [g]")
     style.dress(axes[1], x="time [s]", y="tilt [deg]")
+    return figure
+
+
+FLOW_WINDOW = 0.5
+"""Time over which a flow is averaged [s]."""
+
+
+def draw_flow(flow: DoseFlow) -> Figure:
+    """Flow and mass past the lip over the tilt of the pourer, simulated and by the equation of the dose controller.
+
+    Args:
+        flow: with a comparison.
+    """
+    found = flow.comparison
+    assert found is not None
+    tilts = np.degrees(found.tilts)
+    curves = (
+        ("simulated", found.simulated, {"color": style.MEASURED, "linewidth": 1.8}),
+        ("equation of the controller", found.expected, {"color": style.GREY, "linestyle": "--"}),
+        (
+            f"with {math.degrees(found.onset):+.1f}° and the factor {found.factor:.2f}",
+            found.fitted,
+            {"color": style.BEST},
+        ),
+    )
+    figure, axes = style.new_figure(2, 1, size=(6.4, 5.4), sharex=True)
+    style.entitle(figure, f"{flow.title}: one slow dose of {1e3 * flow.amount:.4g} g")
+    width = max(round(FLOW_WINDOW / float(np.diff(found.times).mean())), 1)
+    for name, mass, line in curves:
+        # (m(t + w/2) − m(t − w/2)) / w, as lumpy as the particles otherwise
+        flows = (mass[width:] - mass[:-width]) / (found.times[width:] - found.times[:-width])
+        axes[0].plot(0.5 * (tilts[width:] + tilts[:-width]), 1e3 * flows, label=name, **line)
+        axes[1].plot(tilts, 1e3 * mass, **line)
+    poured = np.flatnonzero(np.maximum(found.simulated, found.expected) > 0.0)
+    axes[1].set_xlim(tilts[max(int(poured[0]) - 5, 0)] - 1.0 if len(poured) else 0.0, tilts[-1])
+    axes[0].legend(loc="upper left", fontsize=9, frameon=False)
+    style.dress(axes[0], y="flow [g/s]")
+    style.dress(axes[1], x="tilt [deg]", y="past the lip [g]")
     return figure
 
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from orchestrator.campaigns.dose_flows import simulated_knowledge
 from orchestrator.learning.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
 from orchestrator.learning.dispense import KnownSource
 from orchestrator.learning.single_action import OnePour
@@ -242,4 +244,5 @@ def dose_task(
     if plan.laboratory.arm is None:  # the recording shows the motions of an arm, and there is none
         outputs = outputs.model_copy(update={"recording": False})
     small = replace(plan, name=f"{plan.name}-dose", calibration=None, deployment=None, dispense=series, outputs=outputs)
-    return RunRequest(small, dispense_stages(series, recorded_sources), as_written=not amounts)
+    stages = dispense_stages(series, recorded_sources, simulated=partial(simulated_knowledge, small))
+    return RunRequest(small, stages, as_written=not amounts)

@@ -11,11 +11,13 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from actors.dosing.dose_estimator import calibrated_knowledge
 from actors.interfaces import DoseKnowledge
+from orchestrator.campaigns.dose_flows import simulated_knowledge
 from orchestrator.learning.calibration.action_prior import Contexts, drawn_worlds
 from orchestrator.learning.calibration.active_design import ActiveDesign
 from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta, TriedOnAll
@@ -44,7 +46,7 @@ from orchestrator.learning.deployment.calibration_evidence import calibration_ev
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import displacement
-from orchestrator.learning.dispense import KnownSource, ReadSources, SourcesRead
+from orchestrator.learning.dispense import KnownSource, ReadSources, SourcesRead, knowledge_of
 from orchestrator.learning.mixtures import dose_strategy
 from orchestrator.learning.requests import Simulate
 from orchestrator.learning.run_errors import RunError
@@ -144,14 +146,17 @@ def stages_of(plan: CampaignPlan, sources: KnownSources = lambda plan: {}) -> tu
     if plan.deployment is not None:
         stages += deployment_stages(plan, plan.deployment)
     if plan.dispense is not None:
-        stages += dispense_stages(plan.dispense, sources, plan.calibration)
+        stages += dispense_stages(plan.dispense, sources, plan.calibration, partial(simulated_knowledge, plan))
     if (scene := plan.pour) is not None:
         stages.append(StageDefinition(POUR, lambda results, seed: OnePour(scene, scene.action({}), seed), pours=True))
     return tuple(stages)
 
 
 def dispense_stages(
-    plan: DispensePlan, known_sources: KnownSources, calibration: CalibrationPlan | None = None
+    plan: DispensePlan,
+    known_sources: KnownSources,
+    calibration: CalibrationPlan | None = None,
+    simulated: Callable[[], Mapping[str, DoseKnowledge]] = dict,
 ) -> list[StageDefinition]:
     """The content of the sources, which is read once, and the doses.
 
@@ -159,17 +164,19 @@ def dispense_stages(
         plan: the series.
         known_sources: reads what is known of its sources; OSError: it can't be read.
         calibration: that precedes the doses.
+        simulated: returns what simulated doses say about the sources, by name.
     """
 
     def sources(results: Results, seed: int) -> Strategy:
         try:
-            return ReadSources(known_sources(plan))
+            return ReadSources(known_sources(plan), simulated())
         except OSError as error:
             raise RunError(f"the content of the sources is not known: {error}; write 'start: filled'") from error
 
     def doses(results: Results, seed: int) -> Strategy:
-        contents = result_of(results, SOURCES, SourcesRead).sources
-        return dose_strategy(plan, seed, contents, calibrated_sources(plan, calibration, results))
+        read = result_of(results, SOURCES, SourcesRead)
+        expected = {name: knowledge_of(fields) for name, fields in read.simulated.items()}
+        return dose_strategy(plan, seed, read.sources, expected | calibrated_sources(plan, calibration, results))
 
     return [StageDefinition(SOURCES, sources), StageDefinition(DOSES, doses, pours=True)]
 
