@@ -41,8 +41,8 @@ SILENCE = 0.2
 WATCH = 5e-3
 """Longest time between two looks at the driver and the robot during a motion [s]."""
 
-UPRIGHT_SPEED = math.radians(90.0)
-"""Least speed at which the cup is brought upright without a driver [rad/s]; below the limit of the tilt."""
+QUICK = 0.25
+"""Time in which the cup that is brought upright without a driver reaches the limit of its tilt's speed [s]."""
 
 REST = 0.1
 """Time for which speeds are still commanded after the end of that way [s]."""
@@ -250,10 +250,9 @@ class Worker:
             self.halt()
             return
         self._moving, state = False, self._state
-        speed = min(max(UPRIGHT_SPEED, spec.upright_speed), spec.limits.tilt_speed)
-        quick = spec.with_values(upright_speed=speed, approach_speed=2.0 * spec.limits.joint_speed)
+        quick = spec.with_values(upright_speed=spec.limits.tilt_speed, approach_speed=2.0 * spec.limits.joint_speed)
         try:
-            way, _ = upright_way(path, np.ravel(state.q).astype(float), quick)
+            way, _ = upright_way(path, np.ravel(state.q).astype(float), quick, QUICK)
         except LaboratoryError:
             self.halt()
             return

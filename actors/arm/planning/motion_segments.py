@@ -60,13 +60,16 @@ def rejoin(path: JointPath, joints: FloatArray) -> tuple[float, float]:
     return float(time), float(apart[nearest].max())
 
 
-def upright_way(path: PourPath, joints: FloatArray, spec: JointArmSettings) -> tuple[JointPath, FloatArray]:
+def upright_way(
+    path: PourPath, joints: FloatArray, spec: JointArmSettings, ramp: float = RAMP
+) -> tuple[JointPath, FloatArray]:
     """From a stopped pour to an upright pourer: back along the path, or forward if the pourer was already returning.
 
     Args:
         path: that was being executed.
         joints: (n,) where the arm stands [rad].
         spec: its speeds.
+        ramp: time in which it reaches its speed [s].
 
     Returns:
         The way, from rest to rest, and the pourer's tilt at its times [rad].
@@ -86,7 +89,7 @@ def upright_way(path: PourPath, joints: FloatArray, spec: JointArmSettings) -> t
     tilts = np.concatenate([[tilt], tilts])
     turning = np.abs(np.diff(tilts)) / spec.upright_speed
     costs = np.maximum(turning, np.abs(np.diff(points, axis=0)).max(axis=1) / (0.5 * spec.approach_speed))
-    return _paced(points, tilts, costs)
+    return _paced(points, tilts, costs, ramp)
 
 
 def way_home(path: PourPath | PlaceWay, joints: FloatArray, spec: JointArmSettings) -> JointPath:
@@ -126,11 +129,13 @@ def _between(times: FloatArray, start: float, end: float) -> FloatArray:
     return chosen if end >= start else chosen[::-1]
 
 
-def _paced(points: FloatArray, tilts: FloatArray, costs: FloatArray) -> tuple[JointPath, FloatArray]:
+def _paced(
+    points: FloatArray, tilts: FloatArray, costs: FloatArray, ramp: float = RAMP
+) -> tuple[JointPath, FloatArray]:
     """Pass points one after another, each part within at most its time [s], with a smooth start and end."""
     along = np.concatenate([[0.0], np.cumsum(costs)])
     length = float(along[-1])
-    ramp = min(RAMP, max(length, 1e-3))
+    ramp = min(ramp, max(length, 1e-3))
     duration = max(length + ramp, 0.1)
     times = np.linspace(0.0, duration, max(3, int(duration / _GRID)))
     done = np.where(times < ramp, times**2 / (2.0 * ramp), times - 0.5 * ramp)
