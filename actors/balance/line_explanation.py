@@ -104,7 +104,7 @@ def _remedy(line: bytes, allowed: Sequence[Dialect]) -> str:
 
 def _framed(line: bytes) -> str | None:
     """Return the remedy for a line with STX or ETX; None for other lines."""
-    if not is_text(line) or not {0x02, 0x03} & {*line}:
+    if not is_text(line.translate(None, b"\x02\x03")) or not {0x02, 0x03} & {*line}:
         return None
     return (
         "Its lines stand between STX and ETX (\\x02, \\x03), as in no protocol here: switch these off in the balance's "

@@ -31,6 +31,9 @@ FINGERS = 12.0
 RACKS = ("tubeRack", "aluminumBlock", "other")
 """Categories of labware out of which vessels may be taken."""
 
+SHALLOW = 1.0
+"""Largest depth of a mark to calibrate with, or of the tip of a gauge [mm]."""
+
 ON_GRID = 0.5
 """Largest distance of a well from the grid of its rack [mm]."""
 
@@ -142,12 +145,13 @@ class _Labware:
         if self.category not in RACKS or self.tips:
             raise DecantError(
                 f"{path}: '{name}' has the displayCategory {self.category}: its wells are part of it, and no gripper "
-                f"can grip them or take them out; a rack has the displayCategory {' or '.join(RACKS[:2])}"
+                f"can grip them or take them out; a rack has the displayCategory {' or '.join(RACKS[:2])}: if vessels "
+                "do stand in it, change that in the file"
             )
-        if flat := [key for key, (*_, depth) in self.wells.items() if depth <= 0.0]:
+        if flat := [key for key, (*_, depth) in self.wells.items() if depth <= SHALLOW]:
             raise DecantError(
-                f"{path}: the depth of {flat[0]} of '{name}' is not more than 0, as that of a mark to calibrate with: "
-                "no vessel stands in it"
+                f"{path}: the depth of {flat[0]} of '{name}' is not more than {SHALLOW:g} mm, as that of a mark to "
+                "calibrate with: no vessel stands in it"
             )
 
     def grid(self) -> dict[str, float]:

@@ -535,7 +535,7 @@ def is_unit(text: str) -> bool:
     try:
         parse_unit(text, "1", "1")
     except QuantityError as error:
-        return not str(error).startswith("unknown unit")
+        return not str(error).startswith(("unknown unit", "a text of"))  # the second: too long for any unit
     return True
 
 

@@ -87,7 +87,7 @@ def columns_of(
         renamed: names in the file and the names that they stand for, with or without a unit.
         problems: problems are added here.
         unread: unknown columns are added here; None: they are problems. A name that resembles a column which is missing
-            is a problem in both cases.
+            is a problem in both cases, unless it has times of day ('10:15').
     """
     columns: list[FoundColumn | None] = []
     resembling: list[tuple[int, str, _UnknownColumnError]] = []
@@ -112,7 +112,8 @@ def columns_of(
         columns.append(column)
     names = {column.standard for column in columns if column is not None}
     for index, text, unknown in resembling:
-        if unread is not None and (not unknown.guess or unknown.guess in names):
+        clock = all(":" in str(cell) for row in table.rows for cell in row.cells[index : index + 1] if cell != "")
+        if unread is not None and (not unknown.guess or unknown.guess in names or clock):
             unread.append(text)
         else:
             problems.append(table.problem(table.header, index, text, str(unknown)))

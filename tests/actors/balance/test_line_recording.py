@@ -325,6 +325,7 @@ def test_the_files_of_other_programs_are_explained(tmp_path, content, note):
         (bytes(range(128, 256)) * 20, "They are not text: speed or parity differ"),
         (b"\x02ST,+00123.45  g\x03\r\n" * 3, "Its lines stand between STX and ETX"),
         (b"  123.45 g\x03\n\x02" * 3, "Its lines stand between STX and ETX"),
+        (b"\x02  1.250\x03" * 3, "Its lines stand between STX and ETX"),  # Systel, Toledo: no end of line
         (b"G  123.45 g\r\nN  100.00 g\r\nT   23.45 g\r\n", "it sends gross, net and tare in turn"),
         (
             bytes(b | b.bit_count() % 2 << 7 for b in b"ST,+00123.45  g\r\n"),

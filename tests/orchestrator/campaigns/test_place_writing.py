@@ -124,6 +124,8 @@ def test_public_racks_are_read(name: str, tmp_path: Path) -> None:
     ("value", "message"),
     [
         (_of(displayCategory="wellPlate"), "'six tubes' has the displayCategory wellPlate: its wells are part"),
+        # holders of vials from the Labware Creator: machineagency/science-jubilee, septavialrev1_44_holder_2000ul
+        (_of(displayCategory="wellPlate"), "if vessels do stand in it, change that in the file"),
         (_of(displayCategory="reservoir"), "has the displayCategory reservoir: its wells are part of it"),
         ({**tubes(), "parameters": {"isTiprack": True}}, "its wells are part of it"),
         # opentrons_10_tuberack_falcon_4x50ml_6x15ml_conical: columns 3 and 4 are wider apart than 1 and 2
@@ -145,7 +147,7 @@ def test_public_racks_are_read(name: str, tmp_path: Path) -> None:
         (_apart(1.0, depth=600.0), "'six tubes' approach: "),
         (_well("A2", x=float("nan")), "a length is no number"),
         (_apart(1.0, depth=float("inf")), "a length is no number"),
-        (_well("A2", depth=-43.9), "the depth of A2 of 'six tubes' is not more than 0"),
+        (_well("A2", depth=-43.9), "the depth of A2 of 'six tubes' is not more than 1 mm"),
         # Opentrons/opentrons, shared-data/labware/definitions: 1/12-well-plate, 2/opentrons_aluminum_flat_bottom_plate,
         # 2/opentrons_calibrationblock_short_side_left
         (
@@ -153,7 +155,8 @@ def test_public_racks_are_read(name: str, tmp_path: Path) -> None:
             "is a labware definition of schema 1; 2",
         ),
         ({**tubes(), "wells": {}}, "'six tubes' has no wells, so that nothing stands in it"),
-        (_well("A1", depth=0.0), "the depth of A1 of 'six tubes' is not more than 0, as that of a mark to calibrate"),
+        (_well("A1", depth=0.0), "the depth of A1 of 'six tubes' is not more than 1 mm, as that of a mark"),
+        (_well("A1", depth=0.5), "of 'six tubes' is not more than 1 mm"),  # hardware-testing/…/dial_indicator_1
         ({**tubes(), "parameters": None}, "should be a labware definition of Opentrons"),
         ([tubes()], "should be a labware definition of Opentrons"),
     ],

@@ -458,6 +458,21 @@ def test_columns_of_a_notebook_are_remarks_that_are_listed(tmp_path: Path) -> No
     assert table.rows[1].pour({"height": 0.08, "x_offset": 0.1}).remarks["remarks"] == "glass was wet"
 
 
+def test_a_long_text_below_a_name_is_no_unit(tmp_path: Path) -> None:
+    """The title page of a thesis, saved as a workbook."""
+    page = "TITLE\nVision-based robot manipulation of transparent liquid containers in a laboratory\n"
+    assert "column 'poured_g' is missing (not recognised: 'TITLE')" in str(read(tmp_path, page).problems[0])
+
+
+def test_the_time_of_day_of_a_notebook_is_no_misspelt_hold_time(tmp_path: Path) -> None:
+    table = read(
+        tmp_path, NOTEBOOK.replace("date", "Time").replace("2026-11-20", "10:15").replace("2026-11-21", "9:02 pm")
+    )
+    assert "columns 'pour no.', 'Time', 'remarks' read as remarks" in table.assumed
+    (problem,) = read(tmp_path, NOTEBOOK.replace("date", "Time").replace("2026-11-2", "")).problems
+    assert "Time: unknown column; did you mean 'hold_time_s'?" in str(problem)
+
+
 def test_a_table_without_splits_keeps_pours_for_testing_and_names_them(tmp_path: Path) -> None:
     table = read(tmp_path, NOTEBOOK, holdout=2)
     assert [row.split for row in table.rows] == ["train", "test", "train", "test"]
