@@ -112,7 +112,8 @@ def columns_of(
         columns.append(column)
     names = {column.standard for column in columns if column is not None}
     for index, text, unknown in resembling:
-        clock = all(":" in str(cell) for row in table.rows for cell in row.cells[index : index + 1] if cell != "")
+        cells = [str(cell) for row in table.rows for cell in row.cells[index : index + 1] if cell != ""]
+        clock = bool(cells) and all(":" in cell for cell in cells)
         if unread is not None and (not unknown.guess or unknown.guess in names or clock):
             unread.append(text)
         else:
