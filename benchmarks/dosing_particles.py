@@ -10,7 +10,8 @@ where the row's placement says; the grip's error is drawn as on the formula's be
 8000. The final ones begin at 8003: those before were used while the balance did not feel the stream's impact.
 
 The run may be interrupted: `--into FILE` appends each finished series to a file as a line of JSON, and the next run
-with this file makes the others. The first series of all rows come first, then the second ones.
+with this file makes the others. The first series of all rows come first, then the second ones. `--json` writes the
+figures of all series of the file, `--series 0 --json` without making one.
 
 Goals, fixed before the final seeds were used: from the beaker with a spout, the round beaker, mug, cone and bowl a mean
 error of 0.4 g, 1.0 g in 95 %, none beyond 2 g that was reported as reached; small amounts 0.25 g; rapeseed oil and
@@ -93,7 +94,7 @@ ROWS = {
     "bowl": Row("bowl"),
     "narrow cup": Row("narrow"),
     "narrow receiver, lip 5 mm before its rim": Row("beaker", NARROW, lip=0.035),
-    "narrow receiver, moved 30 mm away after the first dose": Row("beaker", NARROW, aside=0.03),
+    "the same, moved 30 mm away after the first dose": Row("beaker", NARROW, lip=0.035, aside=0.03),
     "small amounts": Row("spouted beaker", amounts=SMALL, particles=8000),
     "rapeseed oil": Row("spouted beaker", liquid=OIL),
     "glycerol 50 %": Row("spouted beaker", liquid=GLYCEROL),
@@ -239,17 +240,23 @@ def append(file: Path, row: str, seed: int, doses: Sequence[Dose]) -> None:
     file.write_text(whole + record + "\n", encoding="utf-8")
 
 
-def write(series: dict[tuple[str, int], list[Dose]], names: Sequence[str]) -> None:
-    """Write the figures of rows into the page's data."""
-    from machine import describe
-
-    rows, machine = {}, describe()
+def rows_of(series: dict[tuple[str, int], list[Dose]], names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Figures and seeds of the rows that have doses."""
+    rows = {}
     for name in names:
         seeds = sorted(seed for row, seed in series if row == name)
         doses = [dose for seed in seeds for dose in series[name, seed]]
         if doses:
-            rows[name] = {**figures(doses), "seeds": [seeds[0], seeds[-1]], "machine": machine}
-    DATA.write_text(json.dumps({"rows": rows}, indent=1) + "\n", encoding="utf-8")
+            rows[name] = {**figures(doses), "seeds": [seeds[0], seeds[-1]]}
+    return rows
+
+
+def write(series: dict[tuple[str, int], list[Dose]], names: Sequence[str]) -> None:
+    """Write the figures of rows, of which some series may be missing, into the page's data."""
+    from machine import describe
+
+    data = {"rows": rows_of(series, names), "machine": describe()}
+    DATA.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 def main() -> None:
@@ -265,8 +272,7 @@ def main() -> None:
     options = parser.parse_args()
     first = FIRST_FINAL_SEED if options.final else options.first
     wanted = [(name, seed) for seed in range(first, first + options.series) for name in options.rows]
-    before = finished(options.into)
-    series = {key: before[key] for key in wanted if key in before}
+    series = finished(options.into)
     with ProcessPoolExecutor(options.workers) as pool:
         jobs = {pool.submit(loss_series, *key): key for key in wanted if key not in series}
         for job in as_completed(jobs):
@@ -276,10 +282,10 @@ def main() -> None:
                 append(options.into, name, seed, doses)
             for dose in doses:
                 print(f"  {name}: {dose}", flush=True)
-    for name in options.rows:
-        print(f"{name}: {json.dumps(figures([dose for key in wanted if key[0] == name for dose in series[key]]))}")
     if options.json:
         write(series, options.rows)
+    for name, found in rows_of(series, options.rows).items():
+        print(f"{name}: {json.dumps(found)}")
 
 
 if __name__ == "__main__":

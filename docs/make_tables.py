@@ -562,24 +562,25 @@ def dosing_faults() -> str:
 
 def dosing_particles() -> str:
     """Doses of particles in closed loop."""
-    rows = json.loads((FOLDER / "data" / "dosing-particles.json").read_text(encoding="utf-8"))["rows"]
-    head = [
-        *("source", "doses", "mean error g", "95 % g", "worst g", "over +1 g"),
-    ]
+    data = json.loads((FOLDER / "data" / "dosing-particles.json").read_text(encoding="utf-8"))
+    rows = data["rows"]
+    head = ["source", "doses", "mean error g", "95 % g", "worst g", "mean g", "most spilled g", "interval covers"]
     lines = [
         [
             name,
             str(row["doses"]),
             f"{row['mean']:.2f}",
             f"{row['p95']:.2f}",
-            f"{row['worst']:+.2f}".replace("-", "−"),
-            str(row["over"]),
+            *(f"{row[number]:+.2f}".replace("-", "−") for number in ("worst", "bias")),
+            f"{row['most_spilled']:.1f}",
+            "–" if row["within"] is None else f"{100.0 * row['within']:.0f} %",
         ]
         for name, row in rows.items()
     ]
-    first, last = next(iter(rows.values()))["seeds"]
-    how = f"five doses of each seed from {first} to {last}"
-    return f"{_table(head, lines)}\n<sub>`python benchmarks/dosing_particles.py --final --json`; {how}.</sub>\n"
+    first, last = (pick(row["seeds"][k] for row in rows.values()) for k, pick in enumerate((min, max)))
+    how = f"five doses of each seed from {first} to {last}; {data['machine']['date']}"
+    command = "python benchmarks/dosing_particles.py --final --into FILE --json"
+    return f"{_table(head, lines)}\n<sub>`{command}`; {how}.</sub>\n"
 
 
 def command_line() -> str:
