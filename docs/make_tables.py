@@ -564,7 +564,7 @@ def dosing_particles() -> str:
     """Doses of particles in closed loop."""
     data = json.loads((FOLDER / "data" / "dosing-particles.json").read_text(encoding="utf-8"))
     rows = data["rows"]
-    head = ["source", "doses", "mean error g", "95 % g", "worst g", "mean g", "most spilled g", "interval covers"]
+    head = ["source", "doses", "mean error g", "95 % g", "worst g", "bias g", "most spilled g", "interval covers"]
     lines = [
         [
             name,
