@@ -24,7 +24,7 @@ from orchestrator.daemon.rigs.pour_orders import (
     PourOrder,
     PredictionOut,
     WeighedOut,
-    carried_cup,
+    refusal,
     settled_pour,
 )
 from orchestrator.daemon.rigs.pour_request import PourIn, ResponseModel, SubmissionIn
@@ -181,7 +181,7 @@ class Ordering:
 
         def enter() -> None:
             """Within the transaction of its campaign: the amounts of orders before it are promised already."""
-            if reason := self._refusal(order):
+            if reason := refusal(order, self.materials, self._daemon.settings.rig(item.rig).spec):
                 raise RequestRefusedError(f"{order.id}: {reason}")
             self.book.add(order, item.id, body, predicted)
 
@@ -199,11 +199,8 @@ class Ordering:
         """Check an order and store its snapshot; return them, and the prediction if it is wanted."""
         settings = self._daemon.settings
         order = PourOrder.of(request, self.materials)
-        if reason := self._refusal(order):
-            raise RequestRefusedError(reason)
         rig = self._rig(order, request.rig)
-        cup = carried_cup(order, settings.rig(rig).spec)
-        if cup and (reason := self.materials.refusal_at(cup, order.receiver, order.liquid)):
+        if reason := refusal(order, self.materials, settings.rig(rig).spec):
             raise RequestRefusedError(reason)
         self._queue.refuse_new_work(rig)
         submission = Submission(
@@ -216,10 +213,6 @@ class Ordering:
             await self._forget(item)
             raise
         return item, order, predicted
-
-    def _refusal(self, order: PourOrder) -> str:
-        margin = order.tolerance
-        return self.materials.refusal(order.source, order.receiver, order.liquid, order.amount, margin, pour=order.id)
 
     def _rig(self, order: PourOrder, wanted: str) -> str:
         """The rig of a pour: the given one, that of the vessels, or the only one."""

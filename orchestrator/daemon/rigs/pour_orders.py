@@ -274,6 +274,23 @@ def carried_cup(order: PourOrder, laboratory: LaboratorySettings | None) -> str:
     return f"{laboratory.name}/{order.position}"
 
 
+def refusal(order: PourOrder, materials: Materials, laboratory: LaboratorySettings | None) -> str:
+    """Return the reason why its vessels can't serve an order; '' if they can.
+
+    Args:
+        order: the order.
+        materials: of the station.
+        laboratory: of its rig.
+
+    Raises:
+        OrderError: a vessel stands at no place for it.
+    """
+    reason = materials.refusal(order.source, order.receiver, order.liquid, order.amount, order.tolerance, pour=order.id)
+    if not reason and (cup := carried_cup(order, laboratory)):
+        reason = materials.refusal_at(cup, order.receiver, order.liquid)
+    return reason
+
+
 @dataclass(frozen=True)
 class PlannedOrder:
     """An order with its scene and its whole action."""

@@ -20,7 +20,7 @@ from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.laboratory import WarmSimulators
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.rigs.materials import Materials
-from orchestrator.daemon.rigs.pour_orders import OrderBook, OrderError, PourOrder, carried_cup, renewed, settled_pour
+from orchestrator.daemon.rigs.pour_orders import OrderBook, OrderError, PourOrder, refusal, renewed, settled_pour
 from orchestrator.daemon.rigs.remote_operator import Asking, RemoteOperator, RunQuestions
 from orchestrator.daemon.rigs.submissions import run_request
 from orchestrator.daemon.state.daemon_settings import NO_RIG, DaemonSettings, Rig
@@ -263,12 +263,8 @@ class Running:
         folder = self._shared.settings.snapshots / self.item.id
         order = await asyncio.to_thread(PourOrder.read, folder)
         materials = Materials(self._shared.store)
-        margin = order.tolerance
-        if reason := materials.refusal(order.source, order.receiver, order.liquid, order.amount, margin, pour=order.id):
-            raise OrderError(f"{reason}. Nothing was poured")
         order = renewed(order, materials)
-        cup = carried_cup(order, self._rig.spec)
-        if cup and (reason := materials.refusal_at(cup, order.receiver, order.liquid)):
+        if reason := refusal(order, materials, self._rig.spec):
             raise OrderError(f"{reason}. Nothing was poured")
         await asyncio.to_thread(order.write, folder)
 
