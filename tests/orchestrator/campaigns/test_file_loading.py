@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 
 from actors.interfaces import RaySettings
-from orchestrator.campaigns.file_loading import load_campaign, load_laboratory, load_vessel
+from orchestrator.campaigns.file_loading import campaign_from, load_campaign, load_laboratory, load_vessel
 from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.yaml.yaml_source import Document
 from orchestrator.cli.command_options import call
 from orchestrator.daemon.state.daemon_settings import load_settings
 from orchestrator.learning.calibration.continuous_calibration import C4Settings
@@ -426,3 +427,14 @@ def test_a_run_and_a_planning_go_where_the_campaign_says_else_into_the_working_d
     for plan, folder in ((named, "campaign"), (unnamed, "work")):
         for request in (run_task(plan), plan_task(plan)):
             assert request.campaign.outputs.folder == tmp_path / folder / "runs"
+
+
+def test_values_of_a_program_are_the_campaign_of_the_same_text_and_problems_name_their_keys(tmp_path: Path) -> None:
+    plan = load_campaign(write(write_good(tmp_path), "campaign.yaml", CAMPAIGN))
+    values, path = json.loads(json.dumps(plan.resolved)), tmp_path / "order.json"
+    assert campaign_from(Document.of(values, path)) == campaign_from(Document.parse(json.dumps(values), path))
+    values["calibration"]["pours"]["holdout"] = 1000  # a rule between keys of an inner section
+    with pytest.raises(ConfigError) as caught:
+        campaign_from(Document.of(values, path))
+    (problem,) = caught.value.problems
+    assert (problem.where, problem.line) == ("calibration.pours.holdout", 0)
