@@ -216,7 +216,7 @@ def found_item(queue: CampaignQueue, key: str) -> QueueItem:
 
 def campaign_out(daemon: SharedServices, queue: CampaignQueue, item: QueueItem) -> CampaignOut:
     """Convert a campaign to its response model."""
-    table, progress = asdict(item), daemon.progress(item)
+    table, progress = item.model_dump(), daemon.progress(item)
     waits = item.state not in ENDED and progress is None
     run: Path | None = None if item.run is None else daemon.settings.runs / item.run
     return CampaignOut.model_validate(

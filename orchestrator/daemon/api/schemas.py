@@ -10,6 +10,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from orchestrator.daemon.rigs.pour_request import AfterIn, Moment, RequestModel, ResponseModel
+from orchestrator.daemon.state.daemon_store import CampaignFields
 from orchestrator.learning.dispense import MixedComponent
 from orchestrator.records.verdict import Verdict
 from orchestrator.reports.run_summary import PourSummary
@@ -101,42 +102,11 @@ class AfterOut(ResponseModel):
     """Verdict that it needs."""
 
 
-# More than 20 fields: a flat JSON object that programs read.
-class CampaignOut(ResponseModel):
+class CampaignOut(CampaignFields):
     """A submitted campaign."""
-
-    id: str
-    name: str
-    task: str
-    rig: str
-    mode: str
-    """'virtual', 'hardware', or 'none' if nothing is poured."""
-
-    priority: int
-    state: str
-    """One of: checking, refused, queued, preparing, running, pausing, paused, waiting for operator, stopping, finished,
-    failed, unknown, stopped, withdrawn.
-    """
-
-    desired_state: str
-    """run, pause, stop or abort."""
 
     verdict: Verdict | None
     """What its run reached, once it is at rest; null before, and without a run."""
-
-    reason: str
-    by: str
-    created: float
-    begun: float | None
-    ended: float | None
-    run: str | None
-    """Name of its run's folder."""
-
-    caller_id: str
-    """Id that its caller chose; '' without one."""
-
-    not_before: float | None
-    """Earliest start."""
 
     after: AfterOut | None
     """Campaign that has to end before it starts."""
@@ -147,7 +117,6 @@ class CampaignOut(ResponseModel):
     waits_for: str
     """What has to happen before it starts or continues; '' if only its turn."""
 
-    motion_enabled: bool
     needs_enabling: bool
     """The campaign uses hardware and waits for `decant queue enable` to enable motion."""
 

@@ -13,7 +13,6 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from datetime import datetime
 from typing import Literal
 
@@ -99,7 +98,7 @@ class CampaignQueue:
         self.refuse_new_work(item.rig)
         with self._store.together():
             last = self._store.rows("select coalesce(max(rank), 0) as rank from campaign")[0]["rank"]
-            queued = replace(item, rank=float(last) + 1.0, created=time.time())
+            queued = item.model_copy(update={"rank": float(last) + 1.0, "created": time.time()})
             self._store.add(queued)
             enter()
         self._shared.note(item.by, "submit", item.id)

@@ -11,7 +11,6 @@ import asyncio
 import shutil
 import time
 from collections.abc import Callable, Coroutine
-from dataclasses import replace
 from typing import Any, Literal, TypeVar
 
 from actors.interfaces import InvalidActionError, LaboratoryError
@@ -162,7 +161,7 @@ class Ordering:
                     "Nothing was queued"
                 )
             self._daemon.store.change(earlier.id, caller_id="")
-        return await self._enqueue(replace(item, caller_id=request.id)), True
+        return await self._enqueue(item.model_copy(update={"caller_id": request.id})), True
 
     async def _once(self, key: str, work: Callable[[], Coroutine[Any, Any, Placed]]) -> Placed:
         """Do the same work once for all who ask for it while it lasts; a caller that leaves does not end it."""

@@ -11,7 +11,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -296,7 +296,7 @@ class Running:
 
     def note_run(self, directory: Path) -> None:
         """Write down which folder the run has, before anything happens in it."""
-        self.item = replace(self.item, run=directory.name)
+        self.item = self.item.model_copy(update={"run": directory.name})
         self._shared.store.change(self.item.id, run=directory.name)
 
     def _log_warning(self, text: str) -> None:

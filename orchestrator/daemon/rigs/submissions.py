@@ -31,7 +31,7 @@ from orchestrator.campaigns.yaml.yaml_source import Document
 from orchestrator.catalogue.catalogue import posterior_source
 from orchestrator.daemon.rigs.pour_orders import PlannedOrder, PourOrder
 from orchestrator.daemon.state.daemon_settings import ANY_RIG, NO_RIG, DaemonSettings, Rig
-from orchestrator.daemon.state.daemon_store import CHECKING, DesiredState, QueueItem
+from orchestrator.daemon.state.daemon_store import QueueItem
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal import JOURNAL_NAME
@@ -316,7 +316,7 @@ def prepare(settings: DaemonSettings, submission: Submission, key: str, by: str)
     except BaseException:
         shutil.rmtree(settings.snapshots / item.id, ignore_errors=True)
         raise
-    return replace(item, state="queued")
+    return item.model_copy(update={"state": "queued"})
 
 
 @contextmanager
@@ -350,18 +350,11 @@ def _without_places(text: str, settings: DaemonSettings, folder: Path) -> str:
 def _received(settings: DaemonSettings, submission: Submission, key: str, by: str) -> QueueItem:
     folder = settings.snapshots / key
     draft = QueueItem(
-        key,
-        POUR,
-        submission.task,
-        "",
-        "none",
-        submission.priority,
-        0.0,
-        CHECKING,
-        str(DesiredState.RUN),
-        "",
-        by,
-        0.0,
+        id=key,
+        name=POUR,
+        task=submission.task,
+        priority=submission.priority,
+        by=by,
         not_before=submission.not_before,
         after=submission.after,
     )
@@ -372,7 +365,7 @@ def _received(settings: DaemonSettings, submission: Submission, key: str, by: st
         submission.order.write(folder)
     else:
         plan, rig, body_hash = _stored(settings, submission, folder)
-        draft = replace(draft, name=plan.name, body_hash=body_hash)
+        draft = draft.model_copy(update={"name": plan.name, "body_hash": body_hash})
     work = run_request(settings, draft, Rig(ANY_RIG))
     if rig is None:
         rig = _rig(settings, submission.rig, work)
@@ -383,7 +376,7 @@ def _received(settings: DaemonSettings, submission: Submission, key: str, by: st
     if rig.source is not None:
         work = run_request(settings, draft, rig)
     mode = "none" if rig.name == NO_RIG else work.campaign.laboratory.mode
-    item = replace(draft, id=f"{draft.name[:40]}-{key}", rig=rig.name, mode=mode)
+    item = draft.model_copy(update={"id": f"{draft.name[:40]}-{key}", "rig": rig.name, "mode": mode})
     folder.rename(settings.snapshots / item.id)
     return item
 

@@ -14,12 +14,11 @@ import sqlite3
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, computed_field
+from pydantic import BaseModel, ConfigDict, Field, computed_field
 
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal_file import locked_alone
@@ -128,51 +127,75 @@ ENDED = ("finished", STOPPED, WITHDRAWN, REFUSED)
 """Final states."""
 
 
-@dataclass(frozen=True)
-class QueueItem:
-    """One submitted campaign.
+# Some 20 fields: a flat JSON object that programs read.
+class CampaignFields(BaseModel):
+    """A submitted campaign, as far as the store and the API have the same of it."""
+
+    model_config = ConfigDict(
+        frozen=True, use_attribute_docstrings=True, json_schema_serialization_defaults_required=True
+    )
+
+    id: str
+    """Unique and short enough to type."""
+
+    name: str
+    task: str
+    """'run', 'calibrate', 'plan', or 'pour' for an ordered pour."""
+
+    rig: str = ""
+    """Rig that it leases; 'none' if it pours nothing."""
+
+    mode: str = "none"
+    """'virtual', 'hardware', or 'none' if nothing is poured."""
+
+    priority: int
+    """Higher priorities run first."""
+
+    state: str = CHECKING
+    """One of: checking, refused, queued, preparing, running, pausing, paused, waiting for operator, stopping, finished,
+    failed, unknown, stopped, withdrawn.
+    """
+
+    desired_state: str = DesiredState.RUN.value
+    """run, pause, stop or abort."""
+
+    reason: str = ""
+    """Reason of the state, for the operator."""
+
+    by: str
+    """User who submitted it."""
+
+    created: float = 0.0
+    begun: float | None = None
+    ended: float | None = None
+    run: str | None = None
+    """Name of its run's folder; null before the run starts."""
+
+    motion_enabled: bool = False
+    """Whether motion is enabled for the coming part of its run."""
+
+    caller_id: str = ""
+    """Id that its caller chose; '' without one."""
+
+    not_before: float | None = None
+    """Earliest start."""
+
+
+class QueueItem(CampaignFields):
+    """A campaign in the store.
 
     Attributes:
-        id: unique and short enough to type.
-        task: task: 'run', 'calibrate', 'plan', or 'pour' for an ordered pour.
-        rig: rig that it leases; 'none' if it pours nothing.
-        mode: mode of that rig: 'virtual', 'hardware' or 'none'.
-        priority: higher priorities run first.
         rank: order within one priority, smallest first.
-        state: state of the run (`orchestrator.records.states`), or 'checking', 'refused', 'stopped', 'withdrawn'.
-        desired_state: desired state.
-        reason: reason of the state, for the operator.
-        by: user who submitted it.
-        run: name of its run's folder; None before the run starts.
-        motion_enabled: whether motion is enabled for the coming part of its run.
-        caller_id: id that its caller chose; '' without one.
+        answers: of operators to questions that its run asks when it continues.
         body_hash: digest of its caller's request, by which a repeated one is recognised.
-        not_before: earliest start, seconds since 1970; None: at once.
         verdict: `orchestrator.records.verdict.Verdict` of its run as it came to rest, JSON-ready; None while it runs,
             and without a run that can be read.
         after: id of the campaign that has to end before it, and the verdict that this needs: `campaign`, `verdict`.
     """
 
-    id: str
-    name: str
-    task: str
-    rig: str
-    mode: str
-    priority: int
-    rank: float
-    state: str
-    desired_state: str
-    reason: str
-    by: str
-    created: float
-    begun: float | None = None
-    ended: float | None = None
-    run: str | None = None
-    motion_enabled: bool = False
-    answers: dict[str, Any] = field(default_factory=dict)
-    caller_id: str = ""
+    rank: float = 0.0
+    answers: dict[str, Any] = Field(default_factory=dict)
     body_hash: str = ""
-    not_before: float | None = None
     verdict: dict[str, Any] | None = None
     after: dict[str, str] | None = None
 
@@ -297,7 +320,7 @@ class Store:
 
     def add(self, item: QueueItem) -> None:
         """Add a submitted campaign."""
-        values = {f.name: _written(f.name, getattr(item, f.name)) for f in fields(QueueItem)}
+        values = {name: _written(name, getattr(item, name)) for name in QueueItem.model_fields}
         names = ", ".join(values)
         self.write(f"insert into campaign ({names}) values ({', '.join('?' * len(values))})", *values.values())
 
