@@ -80,6 +80,11 @@ _FIGURES: dict[str, tuple[str, str]] = {
         "Map of the standard deviation of the expected loss over the searched actions.",
         "How uncertain the expected loss is: its standard deviation.",
     ),
+    "film of dose": (
+        "Film strip of a dose: vessels cut open, with coloured particles.",
+        "Particles of the virtual bench in one dose. Blue: in the pourer, light blue: falling, green: received, red: "
+        "spilled.",
+    ),
     "recommended pour": (
         "Film strip of the recommended pour as simulated: vessels cut open, with coloured particles.",
         "One simulation of the recommended pour. Blue: in the pourer, light blue: falling, green: received, red: "

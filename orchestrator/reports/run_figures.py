@@ -45,7 +45,7 @@ from orchestrator.reports.surrogate_figures import (
     draw_surrogate,
     draw_trials,
 )
-from orchestrator.runs.run_folder import film_file, read_film
+from orchestrator.runs.run_folder import dose_film_file, film_file, read_film
 from orchestrator.runs.stages import recommended_pours, scenes_of
 from sim_engine.prediction_band import LEVEL
 from sim_engine.scene import PourTask
@@ -116,6 +116,7 @@ def _drawings(plan: CampaignPlan, results: Results, directory: Path | None = Non
         if mixtures is not None and dose.outcome in (None, "reached"):
             continue  # of many doses, those that missed
         drawings[f"dose {dose.number}"] = partial(draw_dose, dose)
+    drawings |= {} if directory is None else _dose_films(plan, results, directory)
     if plan.deployment is None:
         return drawings
     unit = deployment_unit(plan.deployment)
@@ -135,6 +136,27 @@ def _drawings(plan: CampaignPlan, results: Results, directory: Path | None = Non
                 task = PourTask(scenes[pour.scene], pour.action, pour.parameters, pour.seed)
                 drawings[f"recommended pour {name}"] = partial(_recommended, task, file)
     return drawings
+
+
+def _dose_films(plan: CampaignPlan, results: Results, directory: Path) -> dict[str, Callable[[], Figure]]:
+    """The film strips of doses of particles: those that missed, and the first ones of each source."""
+    films: dict[str, Callable[[], Figure]] = {}
+    sources: set[str] = set()
+    for dose in (dose for dispensed in all_of(results, Dispensed) for dose in dispensed.doses):
+        file = dose_film_file(directory, dose.number)
+        if plan.dispense is None or not file.is_file() or (dose.source in sources and dose.outcome == "reached"):
+            continue
+        sources.add(dose.source)
+        receiver = plan.dispense.doses[min(dose.number, len(plan.dispense.doses)) - 1].receiver
+        scene = plan.dispense.scene(dose.source, receiver)
+        title = f"Dose {dose.number} from {dose.source}: {dose.wanted_g:g} g wanted, {dose.outcome_text or dose.end}"
+        task = PourTask(scene, scene.action({}), plan.parameters, 0)
+        films[f"film of dose {dose.number}"] = partial(_film, task, file, title)
+    return films
+
+
+def _film(task: PourTask, file: Path, title: str) -> Figure:
+    return film_strip(task, read_film(file), title=title)
 
 
 def _recommended(task: PourTask, file: Path) -> Figure:

@@ -11,6 +11,7 @@ same request gives the same outcome at any time, so wrong predictions are discar
 from __future__ import annotations
 
 import asyncio
+import functools
 import inspect
 import os
 from collections import deque
@@ -31,6 +32,7 @@ from actors.interfaces import (
     LinkLostError,
     NotPouredError,
     OperatorQuestion,
+    PourProgress,
     ProgressCallback,
     Restartable,
     SimulationError,
@@ -283,8 +285,9 @@ class RequestExecutor:
         repeats: bool = False,
         arm: ArmSettings | None = None,
         made_by_arm: Collection[str] = (),
+        filmed: Callable[[Pour, Scene, RecordedFrames], None] | None = None,
     ) -> None:
-        self._laboratory, self._ask_operator = laboratory, ask_operator
+        self._laboratory, self._ask_operator, self._filmed = laboratory, ask_operator, filmed
         self._repeats, self._arm, self._made_by_arm = repeats, arm, made_by_arm
         self._refusals: dict[tuple[str, Action], asyncio.Future[str]] = {}
         self._scenes = scenes
@@ -394,12 +397,24 @@ class RequestExecutor:
         bench, scene = self.bench, self._scene(request.scene)
         if self._arm is not None and (reason := await asyncio.to_thread(_refusal, scene, request.action, self._arm)):
             return Failed("invalid_action", reason)
+        frames: list[RecordedFrames] = []
+
+        def report(told: PourProgress) -> None:
+            if told.liquid is not None:
+                frames.append(told.liquid)
+            progress(told)
+
+        kept = self._filmed is not None and request.dose is not None
         async with self._real:
             started()
             try:
                 async with asyncio.timeout(self.deadlines.pour):
                     measurement = await bench.pour(
-                        scene, request.action, seed=request.seed, progress=progress, dose=request.dose
+                        scene,
+                        request.action,
+                        seed=request.seed,
+                        progress=report if kept else progress,
+                        dose=request.dose,
                     )
             except InvalidActionError as error:
                 return Failed("invalid_action", str(error))
@@ -426,6 +441,8 @@ class RequestExecutor:
                     "stopped, and the poured amount is unknown",
                     "; see to the bench. Resuming asks for its outcome",
                 ) from None
+        if frames and self._filmed is not None:
+            self._filmed(request, scene, functools.reduce(RecordedFrames.joined, frames))
         return Poured(measurement)
 
     async def restart(self, error: RequestExecutorError) -> bool:

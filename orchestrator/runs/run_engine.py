@@ -15,9 +15,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from actors.dosing.dose_series import source_of
 from actors.interfaces import Laboratory, LaboratoryError, Notice, Telling
 from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.requests import Pour
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.records.codec import Results
@@ -44,9 +46,18 @@ from orchestrator.runs.resume import (
     read_history,
     settle_unknown_pours,
 )
-from orchestrator.runs.run_folder import FIGURES, film_file, write_film, write_provenance
+from orchestrator.runs.run_folder import (
+    FIGURES,
+    dose_film_file,
+    dose_moments,
+    film_file,
+    write_film,
+    write_provenance,
+)
 from orchestrator.runs.stage_scheduler import StageScheduler
 from orchestrator.runs.stages import StageDefinition, recommended_pours, scenes_of, stage_seed, stages_of
+from sim_engine.outcome import RecordedFrames
+from sim_engine.scene import Scene
 
 RECORDED_SIMULATIONS, FRAME_RATE = 6, 10.0
 """Number of a stage's simulations that are recorded with their particles, and their frames per simulated second."""
@@ -183,6 +194,7 @@ class _RunEngine:
                 repeats=self._plan.on_unknown == "repeat",
                 arm=self._plan.laboratory.expected_arm,
                 made_by_arm=() if deployment is None else {scene.name for scene in deployment.scenes},
+                filmed=self._keep_dose if self._plan.outputs.figures else None,
             )
             executor.speculation.changed = lambda running, waiting: self._journal.append(
                 SpeculationProgressed(running=running, waiting=waiting)
@@ -260,6 +272,15 @@ class _RunEngine:
                     write_film(path, frames)
             except (LaboratoryError, OSError) as error:  # a picture less
                 self._journal.log("warning", f"no picture of the recommended pour into {receiver}: {error}")
+
+    def _keep_dose(self, request: Pour, scene: Scene, frames: RecordedFrames) -> None:
+        """Keep some moments of a dose of particles, for the report's picture."""
+        try:
+            assert request.dose is not None
+            held = source_of(scene, request.dose).mass
+            write_film(dose_film_file(self._directory / FIGURES, request.number), dose_moments(scene, held, frames))
+        except OSError as error:  # a picture less
+            self._journal.log("warning", f"no picture of dose {request.number}: {error}")
 
     @contextmanager
     def _speculating(

@@ -30,7 +30,8 @@ from orchestrator.records.journal_file import TO_BEGIN, JournalError, require_sp
 from orchestrator.records.run_registry import make_state_directory, register, state_directory
 from orchestrator.records.states import State
 from sim_engine.engine_package import engine_version
-from sim_engine.outcome import PourOutcome, RecordedFrames, SimulatedPour
+from sim_engine.outcome import ParticleState, PourOutcome, RecordedFrames, SimulatedPour
+from sim_engine.scene import Scene
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 from sim_engine.solver_fingerprint import ROOT, folder_digest, solver_fingerprint
 
@@ -127,6 +128,51 @@ def film_file(figures: Path, receiver: str) -> Path:
     """File with the simulated particles of a recommended pour, in the folder of a run's pictures."""
     name = re.sub(r"[^\w.-]", "_", receiver)
     return figures / f"recommended-pour-{name}.npz"
+
+
+def dose_film_file(figures: Path, number: int) -> Path:
+    """File with some moments of a dose of particles, in the folder of a run's pictures."""
+    return figures / f"particles-of-dose-{number}.npz"
+
+
+KEPT_MOMENTS = 12
+"""Moments of a dose that are kept: even in the liquid that has left the pourer."""
+
+
+def dose_moments(scene: Scene, mass: float, frames: RecordedFrames) -> SimulatedPour:
+    """Some moments of a dose of particles.
+
+    Args:
+        scene: of the dose.
+        mass: in the pourer before it [kg].
+        frames: of the whole dose.
+    """
+    left = np.array([float(np.mean(states != ParticleState.IN_POURER)) for states in frames.states])
+    levels = np.linspace(0.0, left.max(), KEPT_MOMENTS - 1)
+    chosen = sorted({*(int(np.argmax(left >= level)) for level in levels), len(left) - 1})
+    end = frames.states[-1]
+    shares = np.bincount(end, minlength=5) / len(end)
+    outcome = PourOutcome(
+        received=float(shares[ParticleState.RECEIVED]),
+        spilled=float(shares[ParticleState.SPILLED]),
+        retained=float(shares[ParticleState.IN_POURER]),
+        in_flight=float(shares[ParticleState.IN_FLIGHT]),
+        escaped=float(shares[ParticleState.ESCAPED]),
+        particles=len(end),
+        spacing=(mass / scene.liquid.density / len(end)) ** (1.0 / 3.0),
+        density_error=0.0,
+        simulated_time=float(frames.times[-1]),
+        steps=0,
+        cpu_s=0.0,
+        seed=0,
+    )
+    kept = RecordedFrames(
+        frames.times[chosen],
+        [frames.positions[i] for i in chosen],
+        [frames.states[i] for i in chosen],
+        frames.pourer_poses[chosen],
+    )
+    return SimulatedPour(outcome, kept)
 
 
 def write_film(path: Path, pour: SimulatedPour) -> None:
