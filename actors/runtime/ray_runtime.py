@@ -28,6 +28,7 @@ import os
 import re
 import secrets
 import signal
+import socket
 import sys
 import tempfile
 import threading
@@ -88,7 +89,18 @@ _PRIVATE_SETTINGS = {
     # Ray's own processes log about 5 MB an hour, up to gigabytes.
     "RAY_ROTATION_MAX_BYTES": "2000000",
     "RAY_ROTATION_BACKUP_COUNT": "1",
+    # Limits of wall time within which Ray's processes must reach each other, 5 to 60 s: beside twenty busy processes
+    # they need longer, and whether they run is monitored here anyway.
+    "RAY_agent_register_timeout_ms": "600000",
+    "RAY_gcs_rpc_server_connect_timeout_s": "600",
+    "RAY_health_check_timeout_ms": "60000",
+    "RAY_py_gcs_connect_timeout_s": "600",
+    "RAY_raylet_start_wait_time_s": "600",
+    "RAY_worker_register_timeout_seconds": "600",
 }
+
+_AGENT_PORTS = ("metrics_agent_port", "metrics_export_port", "dashboard_agent_listen_port", "runtime_env_agent_port")
+"""Parameters of Ray's node, and begins of the names of the files in which its agents write these ports."""
 
 _KEPT_SETTINGS = re.compile(r"RAY_(memory_|memory_monitor_|BACKEND_LOG_LEVEL)")
 """Variables of the user's that a private Ray gets all the same: when it ends workers for lack of memory; logging."""
@@ -519,7 +531,7 @@ def _is_cut_off(membership: Any) -> bool:
 
 @contextlib.contextmanager
 def _ray_internals(*, helpers: bool) -> Iterator[None]:
-    """Context for `ray.init`: the only place that uses Ray's private API, for three things that its public API lacks.
+    """Context for `ray.init`: the only place that uses Ray's private API, for what its public API lacks.
 
     - Ray reads most of its environment variables when it is imported. If the user's program has imported it before,
       or this process has used another Ray, Ray must read them again.
@@ -529,6 +541,8 @@ def _ray_internals(*, helpers: bool) -> Iterator[None]:
       need another process.
     - A private Ray that has not registered its node within 30 s has failed, without a setting: a busy machine needs
       longer. Here it has failed if its process has ended, or at `START_DEADLINE`.
+    - The node's process ends itself if its agents have not written their ports to files within 15 s, without a setting
+      (`src/ray/util/port_persistence.h` of 2.60). Here they are given, and the files are written before.
 
     Args:
         helpers: whether to start the three processes; True for a cluster that others have started.
@@ -545,7 +559,14 @@ def _ray_internals(*, helpers: bool) -> Iterator[None]:
     before = {name: getattr(Node, name) for name in left_out if hasattr(Node, name)}
     for name in before:
         setattr(Node, name, lambda node, **settings: None)
-    get_node = services.get_node
+    get_node, start_processes = services.get_node, Node.start_ray_processes
+
+    def with_ports(node: Any) -> None:
+        if not helpers:
+            for name, port in zip(_AGENT_PORTS, _free_ports(len(_AGENT_PORTS)), strict=True):
+                setattr(node._ray_params, name, port)
+                Path(node._session_dir, f"{name}_{node._node_id}").write_text(str(port))  # as the agent writes it
+        start_processes(node)
 
     def registered(*of: Any) -> Any:
         end = time.monotonic() + START_DEADLINE
@@ -557,13 +578,22 @@ def _ray_internals(*, helpers: bool) -> Iterator[None]:
                     raise
             time.sleep(0.2)
 
-    services.get_node = registered
+    services.get_node, Node.start_ray_processes = registered, with_ports
     try:
         yield
     finally:
-        services.get_node = get_node
+        services.get_node, Node.start_ray_processes = get_node, start_processes
         for name, method in before.items():
             setattr(Node, name, method)
+
+
+def _free_ports(count: int) -> list[int]:
+    """Ports of the loopback interface that are free at this moment."""
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for each in sockets:
+            each.bind(("127.0.0.1", 0))
+        return [each.getsockname()[1] for each in sockets]
 
 
 def _raylet_runs() -> bool:
