@@ -14,6 +14,7 @@ import psutil
 import pytest
 
 from actors.runtime import ray_runtime
+from actors.runtime.child_process import own_environment
 from tests.reliability import strikes
 from tests.support.waiting import alive, wait_for
 
@@ -119,7 +120,8 @@ def test_whoever_asks_simulators_or_optimiser_is_told_what_ray_has_lost(whose: s
 @pytest.mark.parametrize("runs", [True, False])
 def test_a_start_of_ray_waits_as_long_as_its_process_runs(monkeypatch: pytest.MonkeyPatch, runs: bool) -> None:
     """Ray itself gives its node 30 s: beside twenty busy processes that was too little."""
-    from ray._private import services
+    with own_environment(**ray_runtime._PRIVATE_SETTINGS):  # which Ray reads when it is imported
+        from ray._private import services
 
     answers: list[dict[str, str] | None] = [None, None, {"node": "registered"}]
 
