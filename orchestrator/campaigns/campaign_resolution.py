@@ -345,7 +345,8 @@ def resolve_campaign(
     memory = None
     if file.prior is not None and laboratory is not None and not report.problems:
         memory = _memory(file, sections, laboratory, root.at("prior"), references, posteriors)
-    sections = sections.with_memory(file, memory).with_arm_limits(laboratory)
+    if not report.problems:
+        sections = sections.with_memory(file, memory).with_arm_limits(laboratory)
     _check_actions(file, builder, root)
     if laboratory is not None:
         _check_repeating(file, sections, laboratory, root.at("on_unknown"), report)

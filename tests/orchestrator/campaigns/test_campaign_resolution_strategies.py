@@ -50,6 +50,14 @@ def refusal(folder: Path, text: str) -> str:
     return str(caught.value)
 
 
+@pytest.mark.parametrize("pours", ["", "12", "[]", "{count: many}"])
+def test_pours_that_are_no_section_are_one_error_with_their_place(tmp_path: Path, pours: str) -> None:
+    """They ended with a traceback."""
+    text = CALIBRATED.replace("{count: 32, holdout: 4}", pours)
+    assert "campaign.yaml:13:" in refusal(tmp_path, text)
+    assert "calibration.pours" in refusal(tmp_path, text)
+
+
 @pytest.mark.parametrize(
     ("keys", "simulations", "settled"),
     [
