@@ -30,7 +30,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict
 
 from actors.interfaces import LaboratoryError
 from orchestrator.learning.campaign_plan import DispensePlan
@@ -79,6 +79,8 @@ LOCK_TIMEOUT = 1.0
 class ContentOut(BaseModel):
     """Content of a vessel."""
 
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
     mass_g: float | None
     """Null if a pour with unknown outcome has changed it."""
 
@@ -94,6 +96,8 @@ class ContentOut(BaseModel):
 
 class AccountOut(BaseModel):
     """One entry of a vessel's account."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
     t: float
     vessel: str
