@@ -11,6 +11,7 @@ nobody requests, and the journal contains only what strategies requested.
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
@@ -54,13 +55,13 @@ class RequestForecast:
         """Queue all predicted simulations; returns when nothing more can be predicted."""
         now, *later = self.stages
         results: dict[str, StageResult] = dict(self.results)
-        placeholder = self._placeholder_result(now)
+        placeholder = await self._placeholder_result(now)
         guessed = placeholder is not None
         unknown: list[SimulationParameters] = []
         if placeholder is not None:
             results[now.name] = placeholder
         for stage in later:
-            strategy = self._built(stage, results)
+            strategy = await self._built(stage, results)
             if strategy is None:
                 continue
             if guessed:
@@ -71,15 +72,15 @@ class RequestForecast:
                 results[stage.name], guessed = stage.stand_in, True
                 unknown.append(calibrated_theta(results).theta)
 
-    def _built(self, stage: StageDefinition, results: Results) -> Strategy | None:
+    async def _built(self, stage: StageDefinition, results: Results) -> Strategy | None:
         try:
-            return stage.build(results, stage_seed(self.seed, stage.name))
+            return await asyncio.to_thread(stage.build, results, stage_seed(self.seed, stage.name))
         except Exception:  # its input is unknown yet; a real problem is reported when the stage runs
             return None
 
-    def _placeholder_result(self, stage: StageDefinition) -> StageResult | None:
+    async def _placeholder_result(self, stage: StageDefinition) -> StageResult | None:
         """Result of a stage that only pours, with placeholder outcomes; None for any other stage."""
-        strategy = self._built(stage, self.results)
+        strategy = await self._built(stage, self.results)
         if strategy is None:
             return None
         for number in range(POURS_MADE_UP):

@@ -240,7 +240,7 @@ class _RunEngine:
             return history.result
         scheduler = StageScheduler(
             stage.name,
-            stage.build(results, seed),
+            await asyncio.to_thread(stage.build, results, seed),  # a simulated dose takes seconds
             journal=self._journal,
             executor=executor,
             capacity=self._plan.parallel_simulations,

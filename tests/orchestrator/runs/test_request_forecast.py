@@ -5,6 +5,7 @@ same.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,10 @@ from orchestrator.learning.requests import Failed, Outcome, Pour, Simulate
 from orchestrator.records.events import Event, RequestFinished, StageClosed
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor, SpeculativeExecution
-from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS
+from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS, StageDefinition
 from sim_engine.scene import PourTask
 from tests.orchestrator.runs.test_stages import Optimizer, calibration, campaign
-from tests.support.scripted_strategy import simulate
+from tests.support.scripted_strategy import Script, pour, simulate
 from tests.support.toy_campaign import ToyBench, ToyLaboratory, ToySimulators, logical_record, run_toy
 
 
@@ -97,6 +98,23 @@ def test_the_next_receivers_prior_is_made_beside_this_ones_pours(tmp_path: Path)
     assert len(ahead) >= len(prior) - 2 > 0  # those with frames are made when they are asked for
     again = [task for task in bench.simulators.tasks[len(made) :] if task in ahead]
     assert not again, "what was made ahead is not made twice"
+
+
+async def test_a_run_stays_alive_while_a_later_stage_is_built(tmp_path: Path) -> None:
+    loop, answered = asyncio.get_running_loop(), []
+
+    def build(results: Any, seed: int) -> Script:
+        turn = asyncio.run_coroutine_threadsafe(asyncio.sleep(0), loop)
+        with contextlib.suppress(TimeoutError):
+            turn.result(10.0)  # of the run's loop, as a signal or a question has one
+        answered.append(turn.done())
+        return Script(simulate(1))
+
+    bench = ToyBench(until=lambda: bool(answered))
+    toy = ToyLaboratory(ToySimulators(separate=True), bench)
+    first = StageDefinition("first", lambda results, seed: Script(pour(1)), pours=True)
+    await run_toy(tmp_path, toy, stages=(first, StageDefinition("second", build)))
+    assert answered == [True, True], "while the arm pours, and when the stage begins"
 
 
 async def test_what_was_foreseen_makes_room_for_what_is_asked_for() -> None:
