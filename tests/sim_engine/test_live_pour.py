@@ -54,7 +54,7 @@ def test_the_liquid_is_bit_for_bit_that_of_the_motion_given_beforehand(
         whole = simulator.simulate(task)
     assert whole.outcome.mirrored is mirrored
     assert whole.frames is not None
-    assert whole.outcome.received > 0.02  # 5 to 7 % of few particles: another processor rounds otherwise
+    assert whole.outcome.received > 0.02  # 0.048 on one processor, more than 0.05 on others
     frames: dict[float, tuple[NDArray[np.float32], NDArray[np.uint8]]] = {}
     # the joints of an emulated arm leave the plane as little
     aside = np.array([0.0, 7e-6, 0.0, 0.0, 7e-8, 0.0, 7e-8]) * mirrored
