@@ -85,6 +85,9 @@ class PourUnknownError(RequestExecutorError):
     exit_code = 3
 
 
+RESTARTS = 3
+"""Attempts to start a virtual bench again, before a pour is repeated."""
+
 KEPT = 2000
 """Maximum number of queued requests and unused outcomes; beyond it, nothing more is queued."""
 
@@ -445,8 +448,12 @@ class RequestExecutor:
             self._filmed(request, scene, functools.reduce(RecordedFrames.joined, frames))
         return Poured(measurement)
 
-    async def restart(self, error: RequestExecutorError) -> bool:
+    async def restart(self, error: RequestExecutorError, failed: Callable[[str], None] = lambda text: None) -> bool:
         """Restart a virtual bench, if a pour can be made again after this error.
+
+        Args:
+            error: that ended the pour.
+            failed: receives why the bench did not start, each time; on a busy machine the next attempt may succeed.
 
         Returns:
             Whether it can: nothing was poured, or the plan repeats pours whose outcome is unknown, and the bench has
@@ -459,12 +466,19 @@ class RequestExecutor:
         try:
             if self.bench.mode != "virtual":
                 return False
-            async with self._real:
-                await laboratory.restart_bench()
-        except LaboratoryError:  # its machine is lost, say: the error that led here says what to do
+            for _ in range(RESTARTS):
+                try:
+                    async with self._real:
+                        await laboratory.restart_bench()
+                    return True
+                except BenchLostError:
+                    raise
+                except LaboratoryError as reason:
+                    _raise_if_cancelled()
+                    failed(f"the virtual bench did not start again: {reason}")
+        except BenchLostError:  # the error that led here says what to do
             _raise_if_cancelled()
-            return False
-        return True
+        return False
 
     async def ask(self, request: Ask) -> Outcome:
         """Ask the operator at the bench, or for proposals the program or person who started the run.

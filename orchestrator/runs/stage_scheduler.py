@@ -274,6 +274,9 @@ class StageScheduler:
                     self._journal.append(PourWithdrawn(stage=self._stage, id=pending.id, reason=reason))
                     pending.started = False
 
+                def not_restarted(text: str) -> None:
+                    self._journal.log("warning", text, stage=self._stage, kept=True)
+
                 while True:
                     self._journal.check_space_for_pour()
                     try:
@@ -282,7 +285,8 @@ class StageScheduler:
                         )
                         break
                     except RequestExecutorError as error:
-                        if pending.attempt - attempt >= REPEATS or not await self._executor.restart(error):
+                        repeats = pending.attempt - attempt
+                        if repeats >= REPEATS or not await self._executor.restart(error, not_restarted):
                             raise
                         text = (
                             f"{error.problem}. The virtual bench was restarted, and pour {request.number} is repeated"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.interfaces import BenchLostError, LinkLostError, UnknownPourError
+from actors.interfaces import BenchLostError, LaboratoryError, LinkLostError, UnknownPourError
 from orchestrator.learning.requests import Poured
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.request_executor import (
@@ -81,6 +81,30 @@ def test_a_bench_that_cannot_be_restarted_leaves_the_error_that_says_what_to_do(
     with pytest.raises(PourNotMadeError, match="connection to the controller was lost") as ended:
         run(tmp_path, laboratory, plan=toy_plan(tmp_path), stages=one_stage(Script(pour(1))))
     assert ended.value.exit_code == 3
+
+
+def test_a_bench_that_does_not_start_on_a_busy_machine_is_started_again_and_the_journal_says_why(
+    tmp_path: Path,
+) -> None:
+    @dataclass
+    class Late(RestartableLaboratory):
+        async def restart_bench(self) -> None:
+            opened, self.bench = self.bench or self.closed, None
+            self.closed, self.restarts = opened, self.restarts + 1
+            if self.restarts < 3:
+                raise LaboratoryError("the arm's process did not start within 60 s")
+            self.bench = opened
+
+        closed: ToyBench | None = None
+
+    laboratory = Late(bench=failing(LOST).bench)
+    script = Script(pour(1))
+    run(tmp_path, laboratory, plan=toy_plan(tmp_path), stages=one_stage(script))
+    assert [type(outcome) for _, outcome in script.told] == [Poured]
+    with JournalReader(tmp_path / JOURNAL_NAME) as journal:
+        told = [str(entry.body.get("text", "")) for entry in journal.entries(kinds=[Kind.NOTE])]
+    reasons = [text for text in told if "did not start within 60 s" in text]
+    assert len(reasons) == 2
 
 
 def test_an_unknown_pour_is_a_person_s_to_tell_otherwise(tmp_path: Path) -> None:
