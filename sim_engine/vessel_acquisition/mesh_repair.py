@@ -61,10 +61,17 @@ HOLE = 0.6
 LARGE_HOLE = 0.01
 """Share of the surface from which a closed hole, or an open surface that is dropped, is a warning."""
 
-ARC, ALL_AROUND, ARC_HEIGHT = 30.0, 330.0, 0.15
-"""Angles around the axis between which a hole is a missing part of the wall [deg], and its least height as a share of
-the vessel's. Smaller holes are closed, larger ones are openings. A flat patch across 30° lies 3 % of the radius
-inside. A gap in the rim lowers the lip however narrow it is; a slanted rim falls over a wider angle than a gap."""
+ARC, ARC_HEIGHT = 30.0, 0.15
+"""Angle around the axis from which a hole is a missing part of the wall [deg], and its least height as a share of the
+vessel's. Smaller holes are closed; a boundary that encloses the axis is an opening. A flat patch across 30° lies 3 % of
+the radius inside. A gap in the rim lowers the lip however narrow it is; a slanted rim falls over a wider angle than a
+gap."""
+
+ALL_AROUND = 350.0
+"""Angle from which a missing part is described without its ends [deg]."""
+
+TOUCHING = 0.5e-3
+"""Largest distance of the edge of a liquid's surface, or of a foot, from the vessel [m]; walls are thicker."""
 
 RIM, COMPACT = 0.98, 0.45
 """Share of the vessel's height from which a hole goes through the rim; share of its box that another one takes."""
@@ -113,10 +120,11 @@ class MissingArc:
     top: float
 
     def __str__(self) -> str:
-        return (
-            f"{self.end - self.begin:.0f}° around the axis ({self.begin:.0f}° to {self.end:.0f}° from x), "
-            f"{1e3 * self.bottom:.0f} to {1e3 * self.top:.0f} mm above the underside"
-        )
+        span = self.end - self.begin
+        where = f"{span:.0f}° around the axis ({self.begin:.0f}° to {self.end % 360.0:.0f}° from x)"
+        if span >= ALL_AROUND:
+            where = "all around the axis"
+        return f"{where}, {1e3 * self.bottom:.0f} to {1e3 * self.top:.0f} mm above the underside"
 
 
 class MissingWallError(VesselError):
@@ -292,6 +300,12 @@ def _closed(mesh: Any, wall: float | None, log: _Log) -> Any:
     sheets = [sheet for sheet, below in zip(removed.sheets, beneath, strict=True) if not below]
     base = [sheet for sheet, below in zip(removed.sheets, beneath, strict=True) if below]
     least = LARGE_HOLE * float(normals_and_areas(vertices, faces)[1].sum())
+    for sheet in removed.sheets:
+        if normals_and_areas(vertices, sheet)[1].sum() >= least and (
+            ring := _missing_ring(upright, faces, sheet, bottom)
+        ):
+            whole = np.vstack([faces, *removed.sheets])
+            raise _missing_wall(log, [ring], upright, whole, boundary_loops(whole))
     areas = [float(normals_and_areas(vertices, sheet)[1].sum()) for sheet in sheets]
     if small := [area for area in areas if area < least]:
         area = 1e4 * sum(small)
@@ -360,13 +374,7 @@ def _without_holes(vertices: Floats, faces: Integers, wall: float | None, log: _
     if opening and (gap := _gap_in_rim(upright, edge := loops[int(lengths.argmax())])) is not None:
         arcs, small = [*arcs, gap], [*small, edge]
     if arcs:
-        raise MissingWallError(
-            f"{log.path.name}: a part of its wall is missing: {' and '.join(map(str, arcs))}. What closes such a "
-            "hole is a guess: scan the vessel again from that side, close the hole in a mesh program, or describe the "
-            "vessel by --height and --diameters (vessel profile)",
-            upright[np.unique(faces)],
-            [upright[loop] for loop in small],
-        )
+        raise _missing_wall(log, arcs, upright, faces, small)
     if small:
         vertices, faces, areas = holes_filled(vertices, faces, small)
         longest = 1e3 * max(_length(vertices, loop) for loop in small)
@@ -391,17 +399,57 @@ def _without_holes(vertices: Floats, faces: Integers, wall: float | None, log: _
     return np.asarray(thick.vertices, dtype=float), np.asarray(thick.faces, dtype=np.int64)
 
 
+def _missing_wall(
+    log: _Log, arcs: list[MissingArc], upright: Floats, faces: Integers, loops: list[Integers]
+) -> MissingWallError:
+    return MissingWallError(
+        f"{log.path.name}: a part of its wall is missing: {' and '.join(map(str, arcs))}. What closes such a "
+        "hole is a guess: scan the vessel again from that side, close the hole in a mesh program, or describe the "
+        "vessel by --height and --diameters (vessel profile)",
+        upright[np.unique(faces)],
+        [upright[loop] for loop in loops],
+    )
+
+
+def _missing_ring(upright: Floats, faces: Integers, sheet: Integers, underside: float) -> MissingArc | None:
+    """The part of an inner or outer wall that is missing all around, between an open surface and the vessel.
+
+    None if the open surface touches the vessel, as that of a liquid does, or if the vessel has no edge around the axis.
+    """
+    import igl
+
+    middle = 0.5 * (upright[faces.ravel(), :2].min(axis=0) + upright[faces.ravel(), :2].max(axis=0))
+    ends = [loop for loop in boundary_loops(faces) if _encloses(upright[loop], middle)]
+    edges = [loop for loop in boundary_loops(sheet) if _encloses(upright[loop], middle)]
+    if not ends or not edges:
+        return None
+    squared = igl.point_mesh_squared_distance(upright[np.concatenate(edges)], upright, faces)[0]
+    if np.median(squared) < TOUCHING**2:
+        return None
+    heights = [float(np.median(upright[loop, 2])) - underside for loop in (*ends, *edges)]
+    return MissingArc(0.0, 360.0, min(heights), max(heights))
+
+
+def _encloses(corners: Floats, middle: Floats) -> bool:
+    """Whether a closed line runs around the axis."""
+    angles = np.arctan2(corners[:, 1] - middle[1], corners[:, 0] - middle[0])
+    turns = (np.roll(angles, -1) - angles + np.pi) % (2.0 * np.pi) - np.pi
+    return bool(abs(turns.sum()) > np.pi)
+
+
 def _missing_arc(upright: Floats, loop: Integers) -> MissingArc | None:
     """The part of the wall that a hole takes out; None for a small hole, one in the floor, or one all around."""
     low, high = upright.min(axis=0), upright.max(axis=0)
     corners, middle = upright[loop], 0.5 * (low + high)[:2]
+    if _encloses(corners, middle):
+        return None
     corners = corners[np.linalg.norm(corners[:, :2] - middle, axis=1) > 0.25 * float(np.min((high - low)[:2]))]
     if len(corners) < 3:
         return None
     angles, begin, span = _around(corners[:, :2] - middle)
     bottom, top = float(corners[:, 2].min() - low[2]), float(corners[:, 2].max() - low[2])
     height = float(high[2] - low[2])
-    if span > ALL_AROUND or top - bottom < ARC_HEIGHT * height:
+    if top - bottom < ARC_HEIGHT * height:
         return None
     # a hole through the rim has an inner and an outer edge; another one fills its box, and a chain of gaps does not
     around = (angles - begin) % 360.0

@@ -398,7 +398,7 @@ def glass(
         return triangles
 
     def arc(angle: float, z: float) -> bool:
-        return not 29.9 <= angle < 29.9 + width
+        return not (angle - 29.9) % 360.0 < width
 
     inner = [(0.0, 4.0), (30.0, 4.0), (33.0, 50.0), (36.0, 95.0)]
     outer = [(39.0, 95.0), (36.0, 50.0), (34.0, 0.0)]
@@ -432,6 +432,8 @@ def glass(
         ("inner wall", 60.0, "60° around the axis (30° to 90° from x), 4 to 95 mm above the underside"),
         ("outer wall", 300.0, "300° around the axis (30° to 330° from x), 0 to 95 mm above the underside"),
         ("inner wall", 300.0, "300° around the axis (30° to 330° from x), 4 to 95 mm above the underside"),
+        ("inner wall", 345.0, "345° around the axis (30° to 15° from x), 4 to 95 mm above the underside"),
+        ("inner wall", 360.0, "all around the axis, 4 to 95 mm above the underside"),
         ("rim", 60.0, "60° around the axis (30° to 90° from x), 70 to 95 mm above the underside"),
         ("rim", 10.0, "10° around the axis (30° to 40° from x), 70 to 95 mm above the underside"),
         ("rim of a sheet", 60.0, "60° around the axis (30° to 90° from x), 66 to 91 mm above the underside"),
