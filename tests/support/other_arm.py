@@ -100,8 +100,7 @@ class SpeedRobot:
             return self.readings[-1]
 
     def turn(self, speeds: FloatArray, seconds: float) -> None:
-        self.measure()
-        with self._lock:
+        with self._lock:  # from the latest measurement on, however late a busy driver sends it
             self._wanted, self._until = speeds, self._now + seconds
 
 
