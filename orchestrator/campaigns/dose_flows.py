@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import math
+import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
@@ -145,20 +146,23 @@ def _content(scene: Scene, amount: float, theta: SimulationParameters) -> str:
 
 
 _compared_before: dict[str, FlowComparison] = {}
+_comparing = threading.Lock()
+"""A stage and the forecast of it may need the same dose at the same time."""
 
 
 def _compared(content: str, scene: Scene, amount: float, theta: SimulationParameters) -> FlowComparison:
-    if content not in _compared_before:
-        name = f"flow-{content}"
-        stored = load_arrays(name)
-        if stored is not None:
-            values = {key: value if value.ndim else float(value) for key, value in stored.items()}
-            _compared_before[content] = FlowComparison(**values)  # type: ignore[arg-type]
-        else:
-            pours = LivePourProcess()
-            try:
-                _compared_before[content] = compare_flows(scene, amount, theta, pours)
-            finally:
-                pours.close()
-            store_arrays(name, {key: np.asarray(value) for key, value in asdict(_compared_before[content]).items()})
-    return _compared_before[content]
+    with _comparing:
+        if content not in _compared_before:
+            name = f"flow-{content}"
+            stored = load_arrays(name)
+            if stored is not None:
+                values = {key: value if value.ndim else float(value) for key, value in stored.items()}
+                _compared_before[content] = FlowComparison(**values)  # type: ignore[arg-type]
+            else:
+                pours = LivePourProcess()
+                try:
+                    _compared_before[content] = compare_flows(scene, amount, theta, pours)
+                finally:
+                    pours.close()
+                store_arrays(name, {key: np.asarray(value) for key, value in asdict(_compared_before[content]).items()})
+        return _compared_before[content]

@@ -67,11 +67,8 @@ vessel's. Smaller holes are closed; a boundary that encloses the axis is an open
 the radius inside. A gap in the rim lowers the lip however narrow it is; a slanted rim falls over a wider angle than a
 gap."""
 
-ALL_AROUND = 350.0
-"""Angle from which a missing part is described without its ends [deg]."""
-
 TOUCHING = 0.5e-3
-"""Largest distance of the edge of a liquid's surface, or of a foot, from the vessel [m]; walls are thicker."""
+"""Largest distance of the edge of a liquid's surface from the vessel [m]; walls are thicker."""
 
 RIM, COMPACT = 0.98, 0.45
 """Share of the vessel's height from which a hole goes through the rim; share of its box that another one takes."""
@@ -121,9 +118,8 @@ class MissingArc:
 
     def __str__(self) -> str:
         span = self.end - self.begin
-        where = f"{span:.0f}° around the axis ({self.begin:.0f}° to {self.end % 360.0:.0f}° from x)"
-        if span >= ALL_AROUND:
-            where = "all around the axis"
+        ends = f"{span:.0f}° around the axis ({self.begin:.0f}° to {self.end % 360.0:.0f}° from x)"
+        where = "all around the axis" if span >= 360.0 else ends
         return f"{where}, {1e3 * self.bottom:.0f} to {1e3 * self.top:.0f} mm above the underside"
 
 
@@ -300,13 +296,11 @@ def _closed(mesh: Any, wall: float | None, log: _Log) -> Any:
     sheets = [sheet for sheet, below in zip(removed.sheets, beneath, strict=True) if not below]
     base = [sheet for sheet, below in zip(removed.sheets, beneath, strict=True) if below]
     least = LARGE_HOLE * float(normals_and_areas(vertices, faces)[1].sum())
-    for sheet in removed.sheets:
-        if normals_and_areas(vertices, sheet)[1].sum() >= least and (
-            ring := _missing_ring(upright, faces, sheet, bottom)
-        ):
+    areas = [float(normals_and_areas(vertices, sheet)[1].sum()) for sheet in sheets]
+    for sheet, area in zip(sheets, areas, strict=True):
+        if area >= least and (ring := _missing_ring(upright, faces, sheet, bottom)):
             whole = np.vstack([faces, *removed.sheets])
             raise _missing_wall(log, [ring], upright, whole, boundary_loops(whole))
-    areas = [float(normals_and_areas(vertices, sheet)[1].sum()) for sheet in sheets]
     if small := [area for area in areas if area < least]:
         area = 1e4 * sum(small)
         log.notes.append(f"{len(small)} small open surface(s), which bound no solid, of {area:.2g} cm² were dropped")
