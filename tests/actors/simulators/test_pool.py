@@ -268,12 +268,16 @@ async def test_busy_time_counts_the_jobs_and_not_the_waiting(make_pool, fake, ta
     await pool.simulate(task(name="quick"))
     before = pool.statistics().busy_s
     await asyncio.sleep(0.3)  # the pool is idle, which must not be counted
+    assert pool.statistics().busy_s == before
+    begin = time.monotonic()
     await asyncio.gather(*(pool.simulate(task(seed=s)) for s in range(3)))
+    elapsed = time.monotonic() - begin
     after = pool.statistics()
     await pool.close()
-    busy, jobs = after.busy_s - before, after.jobs
-    assert jobs == 4
-    assert busy == pytest.approx(0.9, abs=0.25)
+    assert after.jobs == 4
+    assert 0.9 - 0.05 < after.busy_s - before < elapsed + 0.05, (
+        "one simulator, however late a busy machine lets it work"
+    )
 
 
 @pytest.mark.realtime
