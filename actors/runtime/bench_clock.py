@@ -131,6 +131,13 @@ class SharedClock(DeviceClock):
         numbers = [time.monotonic(), time.monotonic(), *[math.inf, 0.0] * len(PROGRAMS)]
         path.write_bytes(array("d", numbers).tobytes())
 
+    @staticmethod
+    def remove(path: Path) -> None:
+        """Remove the file and its folder: the bench does, or what advances the clock when the bench was killed."""
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+            path.parent.rmdir()
+
     @property
     def now(self) -> float:
         """See `DeviceClock.now`; as last written, and the wall time after a stand of `LONGEST_STAND`."""

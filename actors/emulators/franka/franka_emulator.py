@@ -6,7 +6,6 @@ import json
 import math
 import os
 import random
-import shutil
 import tempfile
 import threading
 from pathlib import Path
@@ -42,15 +41,16 @@ class FrankaEmulator:
         require("franky_sim", "a virtual Franka arm")
         if spec.model != "fr3":
             raise LaboratoryError("the emulated Franka is an FR3; write 'model: fr3', or 'mode: hardware'")
-        self._folder = Path(tempfile.mkdtemp(prefix="decant-clock-", dir=os.environ.get(MARK)))
-        clock, draw = self._folder / "clock", random.SystemRandom()
-        SharedClock.create(clock)
+        self._clock = Path(tempfile.mkdtemp(prefix="decant-clock-", dir=os.environ.get(MARK))) / "clock"
+        draw = random.SystemRandom()
+        SharedClock.create(self._clock)
         address = f"127.{draw.randint(1, 254)}.{draw.randint(0, 254)}.{draw.randint(1, 254)}"
-        self._spec = spec.with_values(clock=str(clock), address=address)
+        self._spec = spec.with_values(clock=str(self._clock), address=address)
         self._asking = threading.Lock()
         self._process = ChildProcess(
             [
-                *python_module("actors.emulators.franka.franka_process", "--address", address, "--clock", str(clock)),
+                *python_module("actors.emulators.franka.franka_process", "--address", address),
+                *("--clock", str(self._clock)),
                 *("--time-scale", repr(spec.time_scale), "--joints=" + ",".join(repr(q) for q in spec.home_joints)),
             ],
             prompt=True,
@@ -109,7 +109,7 @@ class FrankaEmulator:
     def close(self) -> None:
         """End it. May be called again."""
         self._process.close(terminate=True)
-        shutil.rmtree(self._folder, ignore_errors=True)
+        SharedClock.remove(self._clock)
 
     def _ask(self, request: dict[str, Any]) -> dict[str, Any]:
         try:

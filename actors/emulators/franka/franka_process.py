@@ -210,6 +210,7 @@ def main() -> None:
         robot = VirtualFranka(simulator, chosen.address, SharedClock(chosen.clock), chosen.time_scale)
         _say(json.dumps({"ready": chosen.address}))
         robot.run()
+        SharedClock.remove(chosen.clock)
 
 
 def _say(answer: str) -> None:

@@ -83,6 +83,8 @@ async def serve(chosen: argparse.Namespace) -> None:
     print(json.dumps(ready), flush=True)
     if chosen.parent is not None:
         await until_orphaned(chosen.parent)
+        if chosen.clock is not None:
+            SharedClock.remove(chosen.clock)
     else:
         await asyncio.Event().wait()
 

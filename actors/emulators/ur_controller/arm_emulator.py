@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import random
-import shutil
 import socket
 import struct
 import tempfile
@@ -48,14 +47,13 @@ class UrEmulator:
     """
 
     def __init__(self, spec: UrArmSettings) -> None:
-        self._folder = Path(tempfile.mkdtemp(prefix="decant-clock-", dir=os.environ.get(MARK)))
-        clock = self._folder / "clock"
-        SharedClock.create(clock)
-        self._spec = spec.with_values(clock=str(clock))
+        self._clock = Path(tempfile.mkdtemp(prefix="decant-clock-", dir=os.environ.get(MARK))) / "clock"
+        SharedClock.create(self._clock)
+        self._spec = spec.with_values(clock=str(self._clock))
         try:
             self._controller = _start_controller(self._spec)
         except BaseException:
-            shutil.rmtree(self._folder, ignore_errors=True)
+            SharedClock.remove(self._clock)
             raise
 
     @property
@@ -112,7 +110,7 @@ class UrEmulator:
     def close(self) -> None:
         """End it. May be called again."""
         self._controller.close()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        SharedClock.remove(self._clock)
 
 
 def _start_controller(arm: UrArmSettings) -> VirtualController:

@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import psutil
 import pytest
@@ -20,6 +21,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from actors.emulators.ur_controller import VirtualController, VirtualControllerError
+from actors.runtime.bench_clock import SharedClock
 from actors.runtime.child_process import child_environment
 from tests.support.hypothesis_examples import examples
 from tests.support.loopback import free_address
@@ -99,7 +101,7 @@ def test_settings_that_make_no_sense_are_told(options: dict[str, object], says: 
 PARENT = """
 import os, sys, time
 from actors.emulators.ur_controller import VirtualController
-controller = VirtualController.start(address=sys.argv[1])
+controller = VirtualController.start(address=sys.argv[1], clock=sys.argv[3])
 if sys.argv[2] == "fork":
     if os.fork() == 0:  # holds the controller's standard input open
         time.sleep(20)
@@ -111,10 +113,12 @@ time.sleep(60)
 
 @pytest.mark.realtime
 @pytest.mark.parametrize("how", ["plain", "fork"])
-def test_it_dies_with_a_parent_that_is_killed(how: str) -> None:
-    address = free_address()
+def test_it_dies_with_a_parent_that_is_killed_and_leaves_no_file(how: str, tmp_path: Path) -> None:
+    address, clock = free_address(), tmp_path / "bench" / "clock"
+    clock.parent.mkdir()
+    SharedClock.create(clock)
     parent = subprocess.Popen(
-        [sys.executable, "-c", PARENT, address, how],
+        [sys.executable, "-c", PARENT, address, how, str(clock)],
         stdout=subprocess.PIPE,
         text=True,
         start_new_session=True,
@@ -127,6 +131,7 @@ def test_it_dies_with_a_parent_that_is_killed(how: str) -> None:
         parent.kill()
         parent.wait()
         assert gone(pid)
+        assert list(tmp_path.iterdir()) == []
     finally:
         parent.kill()
         with contextlib.suppress(ProcessLookupError):

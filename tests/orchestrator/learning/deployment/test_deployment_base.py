@@ -201,7 +201,9 @@ def test_touching_vessels_are_avoided_and_cost_no_pour():
     result = strategy.result()
     assert result.refused_pours > 0
     assert len(played.real_spills) == 8
-    assert [r.number for r in result.pours if r.status == "weighed"] == list(range(1, 9))
+    numbers = [r.number for r in result.pours]
+    assert sorted(set(numbers)) == numbers, "a refused pour keeps its number"
+    assert [r.status for r in result.pours].count("weighed") == 8
     hybrid = make("D3", 1, pours=4, model="adaptive")
     StrategyHarness(touches_when_near).run(hybrid)
     assert hybrid.result().refused_pours <= 1  # simulations have told most of it
