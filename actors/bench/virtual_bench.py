@@ -70,7 +70,7 @@ UPRIGHT = math.radians(0.5)
 """Below this tilt [rad] a pourer is upright; the motions to and from a pour keep it below."""
 
 NOTING_INTERVAL = 40.0
-"""Interval between two reads of the arm's history [s of controller time]; a virtual controller keeps two minutes."""
+"""Interval between two reads of the arm's history [s of controller time]; a virtual controller keeps ten minutes."""
 
 CREEP, CREEP_INTERVAL = 0.02, 1.0
 """Time that passes for the devices [s of the clock] in each interval of wall time [s] in which the liquid is simulated:
@@ -622,7 +622,7 @@ class FollowedBench(VirtualBench):
     async def note(self) -> None:
         """Read the arm's motion since the last call.
 
-        The controller keeps two minutes of its time. If a delayed process reads later, part of the motion is lost. The
+        The controller keeps ten minutes of its time. If a delayed process reads later, part of the motion is lost. The
         gap is recorded, and the masses of the pour are then unknown.
         """
         async with self._noting:

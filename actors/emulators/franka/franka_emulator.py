@@ -76,7 +76,7 @@ class FrankaEmulator:
         """See `ArmEmulator.install`: nothing is needed."""
 
     def history(self, since: float) -> History:
-        """See `ArmEmulator.history`; two minutes of it are kept.
+        """See `ArmEmulator.history`; ten minutes of it are kept.
 
         Raises:
             DeviceLostError: the process does not reply.

@@ -52,7 +52,7 @@ SILENCE = 0.2
 """Wall time after which a moving robot makes a cycle although the clock of the bench stands, or its client is late [s]:
 libfranka counts a second of silence as a lost connection."""
 
-KEPT = 120.0
+KEPT = 600.0
 """Time for which samples are kept [s]."""
 
 STANDING = 4e-3

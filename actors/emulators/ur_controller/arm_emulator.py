@@ -87,7 +87,7 @@ class UrEmulator:
         return self._controller.fault("state", timeout=REPLY_TIMEOUT)
 
     def history(self, since: float) -> History:
-        """See `ArmEmulator.history`; two minutes of it are kept.
+        """See `ArmEmulator.history`; ten minutes of it are kept.
 
         Raises:
             DeviceLostError: the controller does not reply.

@@ -38,8 +38,8 @@ SETTLING = 0.2
 HISTORY_RATE = 125.0
 """Positions stored per second of controller time [Hz]."""
 
-HISTORY_TIME = 120.0
-"""Time for which positions are stored [s]."""
+HISTORY_TIME = 600.0
+"""Time for which positions are stored [s]; at thirty times the pace, 20 s in which a busy host may read none."""
 
 Pose = tuple[float, float, float, float, float, float]
 

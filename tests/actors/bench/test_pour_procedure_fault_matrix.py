@@ -128,7 +128,7 @@ class Tale:
 
 
 class Recorder:
-    """Keeps what the controller's joints do; it forgets after two minutes of its time."""
+    """Keeps what the controller's joints do; it forgets after ten minutes of its time."""
 
     def __init__(self, stage: Stage) -> None:
         self._stage = stage

@@ -11,6 +11,7 @@ import time
 
 import pytest
 
+from actors.emulators.ur_controller.robot import HISTORY_TIME
 from actors.runtime.child_process import child_environment
 
 PACE = 15.0
@@ -54,7 +55,7 @@ def test_a_pour_whose_motion_was_forgotten_is_unknown_and_the_next_one_is_poured
             if line.startswith("tilts"):
                 break
         program.send_signal(signal.SIGSTOP)  # the arm's own process goes on, and completes the pour
-        time.sleep(135.0 / PACE)  # the bench's pour and its settling, of which the stopped program sees nothing
+        time.sleep((HISTORY_TIME + 15.0) / PACE)  # the pour and its settling, of which the stopped program sees nothing
         program.send_signal(signal.SIGCONT)
         outcomes = [line for line in program.stdout if line.startswith("outcome")]
     finally:
