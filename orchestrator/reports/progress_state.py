@@ -188,6 +188,9 @@ PRICE = 1e-3
 RECENT = 9
 """Number of recent durations whose median counts: operators get faster, and other programs start and stop."""
 
+LATE = 3.0
+"""Number of expected durations after which a pour or a simulation counts as late."""
+
 
 @dataclass(frozen=True)
 class WorkEstimate:
@@ -262,7 +265,8 @@ class Forecast:
         cycle = median([planned, planned, *self._cycles])
         left = simulations * wait + progress.pours_left * cycle
         if current:
-            left -= min(max(now - self._since, 0.0), 0.9 * (wait if simulations else cycle))
+            passed, expected = max(now - self._since, 0.0), 0.9 * (wait if simulations else cycle)
+            left += max(passed - LATE * expected, 0.0) - min(passed, expected)  # what is late is as late again
         return max(left, 0.0)
 
     def left(self, now: float) -> float | None:

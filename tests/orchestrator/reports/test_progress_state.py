@@ -135,6 +135,18 @@ def test_the_time_left_falls_while_a_pour_or_a_simulation_takes_its_time() -> No
             assert lefts[0] - lefts[2] == pytest.approx(1.0 if event.stage == "pours" else 0.9 * 0.7, abs=0.1)
 
 
+def test_a_pour_that_takes_much_longer_than_expected_does_not_end_in_a_second() -> None:
+    """A dose of particles on a busy machine: 'about 1 s left' for three minutes."""
+    timeline, forecast = Timeline(), begun()
+    for event in timeline.campaign():
+        forecast(event)
+        if isinstance(event, RequestStarted) and (event.stage, event.id) == ("pours", 5):
+            break
+    lefts = [forecast.left(timeline.now + late) or 0.0 for late in (0.0, 100.0, 200.0)]
+    assert lefts[1] > lefts[0] + 50.0
+    assert lefts[2] == pytest.approx(lefts[1] + 100.0)
+
+
 def test_simulations_beside_a_pour_cost_time_only_where_they_outlast_it() -> None:
     one = Followed(1, 1000.0, {"deployment": WorkEstimate(0, 10, beside=0, pour_time=90.0)})
     few = Followed(1, 1000.0, {"deployment": WorkEstimate(200, 10, beside=20, pour_time=90.0)})
