@@ -564,7 +564,7 @@ def dosing_particles() -> str:
     """Doses of particles in closed loop."""
     data = json.loads((FOLDER / "data" / "dosing-particles.json").read_text(encoding="utf-8"))
     rows = data["rows"]
-    head = ["source", "doses", "mean error g", "95 % g", "worst g", "bias g", "most spilled g", "interval covers"]
+    head = ["source", "doses", "mean error g", "95 % g", "worst g", "bias g"]
     lines = [
         [
             name,
@@ -572,8 +572,6 @@ def dosing_particles() -> str:
             f"{row['mean']:.2f}",
             f"{row['p95']:.2f}",
             *(f"{row[number]:+.2f}".replace("-", "−") for number in ("worst", "bias")),
-            f"{row['most_spilled']:.1f}",
-            "–" if row["within"] is None else f"{100.0 * row['within']:.0f} %",
         ]
         for name, row in rows.items()
     ]
