@@ -62,7 +62,7 @@ class ChainModel(ArmModel):
     """The links of a URDF between a base and a flange.
 
     Args:
-        urdf: the file; meshes are sought in its folder, and in the folders above it for `package://`.
+        urdf: the file; meshes, also those of `package://`, are sought in its folder and in all folders above it.
         base, flange: names of links.
 
     Raises:
@@ -89,10 +89,13 @@ class ChainModel(ArmModel):
             raise ChainError(f"{urdf}: no joint moves link '{flange}' against link '{base}'")
         for k in chain:
             self._check_joint(urdf, whole, k)
+        folders = [str(folder) for folder in urdf.absolute().parents]
         try:
-            shapes = pin.buildGeomFromUrdf(whole, str(urdf), pin.GeometryType.COLLISION, package_dirs=_folders(urdf))
+            shapes = pin.buildGeomFromUrdf(whole, str(urdf), pin.GeometryType.COLLISION, package_dirs=folders)
         except (ValueError, RuntimeError) as error:
-            raise ChainError(f"{urdf}: its collision geometry can't be read: {error}") from None
+            raise ChainError(
+                f"{urdf}: its collision geometry can't be read; meshes are sought in its folder and those above: {error}"
+            ) from None
         kept = [whole.names[k] for k in chain]
         others = [k for k in range(1, whole.njoints) if k not in chain]
         try:
@@ -272,10 +275,6 @@ class ChainModel(ArmModel):
         return f"out of reach by {1e3 * min(apart):.0f} mm; move the receiver nearer to the base"
 
 
-def _folders(urdf: Path) -> list[str]:
-    return [str(folder) for folder in [urdf.parent, *urdf.parents][:4]]
-
-
 def _capsule(shape: Any) -> tuple[list[FloatArray], float]:
     """Ends and radius of a capsule around a collision shape, in the shape's frame [m]."""
     geometry, up = shape.geometry, np.array([0.0, 0.0, 1.0])
@@ -319,7 +318,7 @@ class ChainArmSettings(JointArmSettings):
     """An arm with the kinematics of its URDF."""
 
     urdf: ClassVar[Path]
-    """The file. Collision meshes lie in its folder, or in the folders of their packages above it."""
+    """The file. Collision meshes lie in its folder, or in the folders of their packages above it, at any depth."""
 
     base_link: ClassVar[str] = "base_link"
     """Link whose frame is the arm's base."""

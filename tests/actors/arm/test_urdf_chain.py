@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 pytest.importorskip("pinocchio")
 
@@ -114,13 +115,28 @@ ARM = urdf_of(MODELS["ur10e"])
             ARM.replace('<link name="link2"/>', '<link name="link2"><collision><geometry><mesh filename="no.stl"/>'
                         "</geometry></collision></link>"),
             "flange",
-            r"collision geometry can't be read: .*no.stl",
+            r"collision geometry can't be read; meshes are sought in its folder and those above: .*no.stl",
         ),
     ],
 )  # fmt: skip
 def test_what_is_no_arm_is_refused_with_the_reason(text: str, flange: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ChainError, match=message):
         ChainModel(written(tmp_path, text), "base", flange)
+
+
+def test_meshes_of_a_package_are_read_however_deep_in_it_the_urdf_is(tmp_path: Path) -> None:
+    """As in example-robot-data, see issues 1477 and 1639 of Pinocchio; and without a package, see 1747."""
+    folder = tmp_path / "package" / "robots" / "arm_description" / "urdf"
+    folder.mkdir(parents=True)
+    trimesh.creation.box((0.1, 0.1, 0.4)).export(folder.parent / "link.stl")
+    for name in (
+        "package://package/robots/arm_description/link.stl",
+        "package://arm_description/link.stl",
+        "../link.stl",
+    ):
+        link = f'<link name="link2"><collision><geometry><mesh filename="{name}"/></geometry></collision></link>'
+        chain = ChainModel(written(folder, ARM.replace('<link name="link2"/>', link)), "base", "flange")
+        assert [bar.name for bar in chain.bars] == ["link2", "gripper"]
 
 
 def test_links_lie_within_their_capsules() -> None:
