@@ -32,11 +32,13 @@ class Rosbridge:
 
     Attributes:
         goals: arguments of all goals that were accepted.
+        failure: what a result says, apart from its goal, if goals can't be sent to an action server; else empty.
     """
 
     def __init__(self, robot: SimulatedRobot, threads: bool = True) -> None:
         self.robot, self._threads = robot, threads
         self.goals: list[dict[str, Any]] = []
+        self.failure: dict[str, Any] = {}
         self._canceled: dict[str, threading.Event] = {}
         self._clients: set[ServerConnection] = set()
         self.port = 0
@@ -96,6 +98,10 @@ class Rosbridge:
     def _send_action_goal(self, client: ServerConnection, message: dict[str, Any]) -> None:
         assert message["action"] == "/joint_trajectory_controller/follow_joint_trajectory"
         assert message["action_type"] == "control_msgs/action/FollowJointTrajectory"
+        if self.failure:
+            answer = {"op": "action_result", "action": message["action"], "id": message["id"]}
+            client.send(json.dumps({**answer, **self.failure}))
+            return
         self._canceled[message["id"]] = threading.Event()
         if self._threads:
             self._later(self._follow, client, message)
@@ -104,7 +110,8 @@ class Rosbridge:
 
     def _cancel_action_goal(self, client: ServerConnection, message: dict[str, Any]) -> None:
         assert message["action"] == "/joint_trajectory_controller/follow_joint_trajectory"
-        self._canceled[message["id"]].set()
+        if canceled := self._canceled.get(message["id"]):
+            canceled.set()
 
     def _follow(self, client: ServerConnection, message: dict[str, Any]) -> None:
         trajectory, canceled = message["args"]["trajectory"], self._canceled[message["id"]]
