@@ -133,7 +133,9 @@ class FrankaRobot:
             if not replied:
                 connection.close()  # it then brings the cup upright, and ends
                 if name == "open":
-                    raise ConnectionError(f"the robot at {address} does not reply: is another client in control?")
+                    raise ConnectionError(
+                        f"the robot at {address} does not reply: check that no other client is in control"
+                    )
                 raise ConnectionError(f"the driver's process for {address} does not reply")
         if isinstance(reply, Exception):
             raise reply

@@ -148,8 +148,8 @@ class Worker:
             raise ArmRefusedError(f"this computer needs a real-time kernel: {error}") from error
         except ERRORS as error:
             raise ConnectionError(
-                f"no connection to the robot at {spec.address} ({error}): is FCI active in Desk, is the cable in the "
-                "control box, and is no other client in control?"
+                f"no connection to the robot at {spec.address} ({error}): check that FCI is active in Desk, that the "
+                "cable is in the control box, and that no other client is in control"
             ) from error
         self._spec = spec
         self._compare(spec)

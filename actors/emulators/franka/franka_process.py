@@ -52,6 +52,9 @@ SILENCE = 0.2
 """Wall time after which a moving robot makes a cycle although the clock of the bench stands, or its client is late [s]:
 libfranka counts a second of silence as a lost connection."""
 
+REMINDER = 0.05
+"""Wall time without a new state after which the last one is sent again [s]; without any, a client gives up."""
+
 KEPT = 600.0
 """Time for which samples are kept [s]."""
 
@@ -65,6 +68,8 @@ class Ports(franka_robot_server.FrankaRobotServer):  # type: ignore[misc]  # it 
     reflex = unplugged = False
     quiet = 0
     """States that were sent since the last command of a motion; 0 before its first one."""
+    sent = 0.0
+    """Wall time at which a state was sent [s]."""
 
     def start_motion(self, *arguments: Any) -> None:
         """Begin a motion."""
@@ -78,7 +83,15 @@ class Ports(franka_robot_server.FrankaRobotServer):  # type: ignore[misc]  # it 
     def send_state(self) -> None:
         """Send the state to a client."""
         super().send_state()
+        self.sent = time.monotonic()
         self.quiet += self.quiet > 0
+
+    def remind(self) -> None:
+        """Send the last state again, if a client has had none for a while."""
+        if self._FrankaServer__message_id and time.monotonic() > self.sent + REMINDER:
+            self._FrankaServer__message_id -= 1
+            super().send_state()
+            self.sent = time.monotonic()
 
     @property
     def late(self) -> bool:
@@ -142,6 +155,7 @@ class VirtualFranka:
             waits = time.monotonic() + longest
             while not (passes := self._clock.may_pass(period)) and time.monotonic() < waits:
                 self._clock.advance(0.0)
+                self._ports.remind()
                 time.sleep(2e-4)
             self._cycle()
             self._clock.advance(period if passes else 0.0)
@@ -170,6 +184,7 @@ class VirtualFranka:
             waits = time.monotonic() + SILENCE
             while (late := ports.late) and time.monotonic() < waits:
                 self._clock.advance(0.0)
+                ports.remind()
                 time.sleep(2e-4)
                 ports.process_commands()
             self._waited = self._waited + SILENCE if late else 0.0

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import random
 import subprocess
 import sys
 import time
@@ -22,6 +23,8 @@ pytest.importorskip("pinocchio")
 pytest.importorskip("franky")
 pytest.importorskip("franky_sim")
 
+import franky
+
 from actors.arm.arm_interface import ArmLostError, ArmRefusedError
 from actors.arm.franka.franka_arm import FrankaRobot, FrankaSettings
 from actors.arm.joint_driver import VelocityArm, speeds_along
@@ -32,6 +35,7 @@ from actors.contract_tests.arm_contract import ArmBench, ArmContract
 from actors.contract_tests.contract_calls import Call
 from actors.device_kinds import FrankaKind
 from actors.emulators.franka.franka_emulator import FrankaEmulator
+from actors.runtime.bench_clock import SharedClock
 from actors.runtime.child_process import child_environment
 from sim_engine.action import DEG
 from sim_engine.liquids import Liquid
@@ -209,12 +213,44 @@ def test_a_reflex_is_recovered_from_by_a_persons_word_only(
     assert arm.facts().problem == ""
 
 
+PATIENT_ROBOT = """
+from actors.emulators.franka import franka_process
+franka_process.SILENCE = 240.0
+franka_process.main()
+"""
+
+
+def test_a_client_is_not_lost_while_the_clock_of_the_bench_stands(tmp_path: Path) -> None:
+    """The liquid is computed for seconds, or the host is slow; libfranka waits for one second."""
+    SharedClock.create(tmp_path / "clock")
+    clock, address = SharedClock(tmp_path / "clock"), f"127.77.{random.randint(0, 254)}.{random.randint(1, 254)}"
+    joints = "--joints=" + ",".join(map(repr, SETTINGS.home_joints))
+    command = [sys.executable, "-c", PATIENT_ROBOT, "--address", address, "--clock", str(tmp_path / "clock"), joints]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=child_environment()) as process:
+        assert process.stdout is not None
+        assert b"ready" in process.stdout.readline()
+        robot = franky.Robot(address, realtime_config=franky.RealtimeConfig.Ignore)
+        robot.move(franky.JointVelocityMotion([0.0] * 6 + [0.02]), asynchronous=True)
+        until(lambda: float(robot.state.dq[6]) > 0.01, "it does not move")
+        clock.promise("liquid", 0.0)
+        stood = robot.state.time.to_sec()
+        time.sleep(3.0)
+        assert robot.state.time.to_sec() < stood + 0.1
+        clock.withdraw("liquid")
+        until(lambda: robot.state.time.to_sec() > stood + 0.2, "it does not go on")
+        assert robot.is_in_control
+        robot.stop()
+        process.stdin.close()  # type: ignore[union-attr]
+
+
 # ---- what does not fit
 
 
 def test_nobody_at_the_address(emulator: FrankaEmulator) -> None:
     arm = VelocityArm(emulator.arm.with_values(address="127.255.255.1"), FrankaRobot)
-    with pytest.raises(ArmLostError, match=r"no connection to the robot at 127\.255\.255\.1 .*is FCI active in Desk"):
+    with pytest.raises(
+        ArmLostError, match=r"robot at 127\.255\.255\.1 .*: check that FCI is active in Desk, .* in control\."
+    ):
         arm.connect()
     arm.close()
 
@@ -223,7 +259,7 @@ def test_another_client_in_control(emulator: FrankaEmulator, arm: VelocityArm, m
     arm.connect()
     monkeypatch.setattr("actors.arm.franka.franka_arm.OPEN_TIME", 0.5)
     second = VelocityArm(emulator.arm, FrankaRobot)
-    with pytest.raises(ArmLostError, match="is another client in control"):
+    with pytest.raises(ArmLostError, match=r"check that no other client is in control\. The"):
         second.connect()
     second.close()
     assert arm.facts().problem == ""
