@@ -180,9 +180,10 @@ def wired_spec(
     operator: OperatorSettings | None = None,
     *,
     hurried: bool = False,
+    laboratory: str = "virtual.yaml",
 ) -> LaboratorySettings:
-    """The shipped virtual laboratory with an exact balance; `hurried` saves time where that changes nothing."""
-    spec = load_laboratory(LABORATORIES / "virtual.yaml")
+    """A shipped virtual laboratory with an exact balance; `hurried` saves time where that changes nothing."""
+    spec = load_laboratory(LABORATORIES / laboratory)
     assert spec.arm is not None
     assert spec.balance is not None
     device = spec.balance
