@@ -94,7 +94,7 @@ class ChainModel(ArmModel):
             shapes = pin.buildGeomFromUrdf(whole, str(urdf), pin.GeometryType.COLLISION, package_dirs=folders)
         except (ValueError, RuntimeError) as error:
             raise ChainError(
-                f"{urdf}: its collision geometry can't be read; meshes are sought in its folder and those above: {error}"
+                f"{urdf}: its collision geometry can't be read ({error}); meshes are sought in its folder and above"
             ) from None
         kept = [whole.names[k] for k in chain]
         others = [k for k in range(1, whole.njoints) if k not in chain]

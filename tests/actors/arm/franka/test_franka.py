@@ -234,7 +234,7 @@ def test_a_client_is_not_lost_while_the_clock_of_the_bench_stands(tmp_path: Path
         until(lambda: float(robot.state.dq[6]) > 0.01, "it does not move")
         clock.promise("liquid", 0.0)
         stood = robot.state.time.to_sec()
-        time.sleep(3.0)
+        time.sleep(3.0)  # three times libfranka's limit
         assert robot.state.time.to_sec() < stood + 0.1
         clock.withdraw("liquid")
         until(lambda: robot.state.time.to_sec() > stood + 0.2, "it does not go on")
