@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from actors.balance.balance_interface import unsettled
 from actors.balance.dialect_registry import dialects
-from actors.balance.dialects.dialect import Dialect
+from actors.balance.dialects.dialect import Dialect, LineForm
 from actors.balance.line_recording import Capture
 from actors.balance.readings import (
     IN_TURN,
@@ -30,6 +30,9 @@ from actors.balance.readings import (
 _LONGEST = 60
 _MOST = 4
 """Weights and other lines that are printed of a capture."""
+
+MOSTLY = 0.8
+"""Least share of the best dialect's weights that a dialect reads which refuses damaged lines only."""
 
 _COUNTED = re.compile(r"(?i)(?:%|\b(?:pcs?|stk|lb:oz|pcs/\w+)\b|\blb +[0-9.]+ *oz\b)")
 _LABEL = re.compile(rb"\s*(?:(G|GS|GROSS|B)|(N|NT|NET)|(T|TR|PT|TARE))\b[\s:.,#]*[-+]?\s*[0-9.]+", re.IGNORECASE)
@@ -164,17 +167,28 @@ class DialectFit:
     masses: list[float] = field(default_factory=list)
     marks: set[WeightMark] = field(default_factory=set)
     others: Counter[str] = field(default_factory=Counter)
+    _form: LineForm = field(default_factory=LineForm)
+    _valid: set[int] = field(default_factory=set)
+    _invalid: set[int] = field(default_factory=set)
 
     def add(self, line: bytes, reply: object) -> None:
         """Count a line and its decoded reply."""
+        if isinstance(reply, Reading) and reply.value is not None and not self._form.keeps(line):
+            reply = LineError("its number is elsewhere than in the lines before it; it has lost characters")
         if isinstance(reply, LineError) and not isinstance(reply, OtherQuantityError):
             self.others[f"invalid: {shown_bytes(line)}: {reply}"] += 1
+            self._invalid.add(len(line))
             return
+        self._valid.add(len(line))
         self.understood += 1
         if isinstance(reply, OtherQuantityError):
             self.others[f"{reply.what}, not a weight"] += 1
         elif isinstance(reply, Reading):
             self._add_reading(reply)
+
+    def lacks_only_damaged_lines(self, best: DialectFit) -> bool:
+        """Whether the lines that the best dialect reads in addition are few, and have other lengths than whole lines."""
+        return self.weights >= MOSTLY * best.weights and self._valid.isdisjoint(self._invalid)
 
     def _add_reading(self, reading: Reading) -> None:
         moving = reading.status is ReadingStatus.UNSTABLE and not reading.unit  # some leave the unit out meanwhile
@@ -192,11 +206,13 @@ class DialectFit:
 def best_fits(lines: Sequence[bytes]) -> list[DialectFit]:
     """Decode lines in every installed dialect; return those that read the most weights and understand the most lines.
 
+    A strict dialect fits as well if it refuses only damaged lines.
+
     Args:
         lines: as they came, without their ends.
 
     Returns:
-        Fits of equal quality; none if no dialect reads a weight.
+        Fits of equal quality, that with the most weights first; none if no dialect reads a weight.
     """
     fits = []
     for dialect in dialects().values():
@@ -205,8 +221,11 @@ def best_fits(lines: Sequence[bytes]) -> list[DialectFit]:
         for line in lines:
             fit.add(line, replies[line])
         fits.append(fit)
-    best = max((fit.weights, fit.understood) for fit in fits)
-    return [fit for fit in fits if (fit.weights, fit.understood) == best and fit.weights]
+    fits.sort(key=lambda fit: (-fit.weights, -fit.understood))
+    best = fits[0]
+    equal = (best.weights, best.understood)
+    alike = [fit for fit in fits if (fit.weights, fit.understood) == equal or fit.lacks_only_damaged_lines(best)]
+    return alike if best.weights else []
 
 
 def explain_capture(capture: Capture) -> tuple[list[str], str | None]:

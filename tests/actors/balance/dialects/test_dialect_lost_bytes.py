@@ -20,6 +20,7 @@ from actors.balance.dialects.mt_sics import MT_SICS
 from actors.balance.dialects.ohaus import OHAUS
 from actors.balance.dialects.radwag import RADWAG
 from actors.balance.dialects.sbi import SBI, Sbi
+from actors.balance.line_explanation import best_fits
 from actors.balance.readings import LineError, Reading, ReadingStatus
 
 LAYOUTS: tuple[Dialect, ...] = (
@@ -90,3 +91,13 @@ def test_the_driver_refuses_a_line_of_another_form() -> None:
 
 def test_a_fault_of_sartorius_may_have_one_letter() -> None:
     assert SBI.decode(b"   E 054      ") == Reading(ReadingStatus.ERROR, detail="error 054")
+
+
+@pytest.mark.parametrize("dialect", (KCP, KERN_SWT, SBI, A_AND_D, KERN_CONTINUOUS), ids=lambda dialect: dialect.name)
+def test_a_capture_with_damaged_lines_lists_the_dialect_of_its_whole_lines(dialect: Dialect) -> None:
+    weights = [f"{10.37 + 12.5 * i:.2f}" for i in range(20)]
+    lines = [line_of(dialect, weight) for weight in weights]
+    cut = lines[3].index(b"7")  # the last digit
+    fits = best_fits([*lines[:5], lines[3][:cut] + lines[3][cut + 1 :], *lines[5:], lines[3][:-1]])
+    fit = next(fit for fit in fits if fit.dialect is dialect)
+    assert set(fit.reads) == {f"{weight} g" for weight in weights}
