@@ -4,7 +4,8 @@
   a pour as the others are.
 - Two training pours whose weights were exchanged pull θ* towards both, and may each stay inside their intervals. They
   are recognised as a pair, by shifts that were weighed in the opposite order of the simulated ones.
-- `without_misfits` selects θ* again, from the simulations that exist, on the pours that fit.
+- `without_misfits` selects θ* again, from the simulations that exist, on the pours that fit. C4 with a given
+  number of simulations has simulated each θ at one action only; `misfit_sentence` then advises to calibrate again.
 
 Limitation: of two pours that spill nearly the same amount, an exchange can't be recognised. Of 12 pours, a third of
 the exchanges are recognised if the shifts differ by 2.5 deviations of a pour, and seven of eight at 4, such as 1 and
@@ -260,6 +261,8 @@ def misfit_sentence(residuals: Sequence[SpillageResidual], without: WithoutMisfi
             f"; without them θ* would be {values}, mean |Δ| of the others {_percent(without.discrepancy)} "
             f"(now {_percent(without.discrepancy_now)})"
         )
+    elif any(pour.split == "train" and pour.line is not None for pour in misfits):
+        text += "; for θ* without them, enter 'test' as their 'split' and calibrate again"
     return text
 
 

@@ -227,6 +227,15 @@ def test_two_exchanged_weights_are_named_as_a_pair_though_each_lies_in_its_inter
     assert "the weights of pour 3 and pour 12 seem to be exchanged" in misfit_sentence(pours, None)
 
 
+def test_where_no_theta_without_the_misfits_was_simulated_the_sentence_says_how_to_find_it() -> None:
+    spilled = [0.02, 0.05, 0.11, 0.02, 0.09, 0.50]
+    pours = compared(spilled, [0.02, 0.05, 0.11, 0.02, 0.09, 0.03])
+    of_a_table = [pour.model_copy(update={"line": pour.number + 1}) for pour in pours]
+    advice = "for θ* without them, enter 'test' as their 'split' and calibrate again"
+    assert advice in misfit_sentence(of_a_table, None)
+    assert advice not in misfit_sentence(pours, None), "pours of the bench have no table"
+
+
 def test_weights_that_scatter_are_not_called_exchanged() -> None:
     rng, tables = np.random.default_rng(4), 200
     named = 0
