@@ -10,6 +10,8 @@ STARTING_SET = (
 )  # fmt: skip
 """The shipped files that `starting_set` copies."""
 
+_BESIDE, _INSIDE = "directory: ../../runs", "directory: ../runs"
+
 
 def shipped(name: str = "") -> Path:
     """Path of a shipped file such as 'campaigns/quickstart.yaml'; without a name, the folder of all of them.
@@ -27,6 +29,8 @@ def shipped(name: str = "") -> Path:
 
 def starting_set(directory: Path | str) -> list[Path]:
     """Copy the shipped files into a folder: `decant init DIR`.
+
+    Their runs go into a folder next to it; of a copy into the working directory, into this directory.
 
     Args:
         directory: created if needed; must be empty.
@@ -48,6 +52,9 @@ def starting_set(directory: Path | str) -> list[Path]:
             shutil.copytree(source, directory / name)
         else:
             shutil.copy(source, directory / name)
+    if directory.resolve() == Path.cwd():
+        for path in directory.glob("*/*.yaml"):
+            path.write_text(path.read_text("utf-8").replace(_BESIDE, _INSIDE), "utf-8")
     return sorted((directory / "campaigns").glob("*.yaml"))
 
 

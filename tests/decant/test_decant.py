@@ -118,6 +118,17 @@ def test_a_starting_set_is_copied_whole_and_never_over_something(tmp_path: Path)
         decant.starting_set(tmp_path / "lab")
 
 
+@pytest.mark.parametrize("directory", ["lab", "."])
+def test_runs_of_a_starting_set_are_in_the_working_directory(
+    directory: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for path in [*decant.starting_set(directory), *Path(directory).glob("studies/*.yaml")]:
+        text = path.read_text()
+        named = text.split("directory: ")[1].split()[0].rstrip("}")
+        assert (path.parent / named).resolve() == tmp_path / "runs"
+
+
 def test_a_built_campaign_names_the_place_of_what_is_wrong_in_it() -> None:
     content = decant.load_campaign(decant.shipped("campaigns/quickstart.yaml")).resolved
     with pytest.raises(decant.ConfigError, match="simulatons"):
