@@ -173,7 +173,7 @@ class DialectFit:
 
     def add(self, line: bytes, reply: object) -> None:
         """Count a line and its decoded reply."""
-        if isinstance(reply, Reading) and reply.value is not None and not self._form.keeps(line):
+        if _may_be_mass(reply) and not self._form.keeps(line):
             reply = LineError("its number is elsewhere than in the lines before it; it has lost characters")
         if isinstance(reply, LineError) and not isinstance(reply, OtherQuantityError):
             self.others[f"invalid: {shown_bytes(line)}: {reply}"] += 1
@@ -306,6 +306,11 @@ def _decoded(dialect: Dialect, line: bytes) -> object:
         return dialect.decode(line)
     except LineError as error:
         return error
+
+
+def _may_be_mass(reply: object) -> bool:
+    """Whether a reply is a weight in a unit of mass, or without a unit."""
+    return isinstance(reply, Reading) and reply.value is not None and (not reply.unit or reply.mass() is not None)
 
 
 def _is_mass(dialect: Dialect, line: bytes) -> bool:

@@ -351,6 +351,12 @@ def test_the_files_of_other_programs_are_explained(tmp_path, content, note):
         (b"-00.000\r\n 00.165\r\n" * 2, "to print the weight in g with its unit"),  # Dibal, a POS scale of its manual
         (b"\x02A   0.165\r\x03" * 3, "Its lines stand between STX and ETX"),  # qzind/tray, issue 881
         (b"+ ~~~~~~~~GN\r\n" * 3, "no dialect reads a weight"),  # eamars/OpenTrickler-RP2040-Controller, 49: overload
+        (b"---\r\n" * 3, "no dialect reads a weight"),  # eamars/OpenTrickler-RP2040-Controller, pull request 79
+        # Adam Equipment's manual of the Highland series, output formats 1 and 2
+        (b"GS      123.45 g \r\nNo.         01 \r\nTotal   123.45 g \r\n\r\n\r\n", "no dialect reads a weight"),
+        (b"GT,NT      123.45 g \r\n\r\n\r\n" * 2, "no dialect reads a weight"),
+        (b"       123.45dwt\r\n" * 2, "to print the weight in g with its unit"),
+        (b"          125PCS\r\n" * 2, "to print the weight in g with its unit"),
         (b"dear colleague,\nthe balance does not work\n", "no dialect reads a weight"),
     ],
 )
@@ -361,6 +367,21 @@ def test_lines_without_any_weight_fit_no_dialect(tmp_path, content, said):
     assert result.exit_code == 1
     assert said in result.stderr
     assert "best fit" not in result.stdout
+
+
+def test_counts_and_pennyweights_of_a_balance_in_kerns_columns_are_no_grams(tmp_path):
+    """Adam Equipment's Highland, output format 2: 16 characters, as an older Kern's."""
+    path = tmp_path / "capture.txt"
+    path.write_bytes(b"       123.45 g \r\n          125PCS\r\n       123.45dwt\r\n-       23.45 g \r\n")
+    result = explain(path)
+    assert "(2 weights in 4 lines)" in result.stdout
+    assert "stable weights: 123.45 g, -23.45 g\n" in result.stdout
+
+
+def test_a_count_among_weights_is_shown_as_a_count(tmp_path):
+    path = tmp_path / "capture.txt"
+    path.write_bytes(b"       52.320 g  \r\n           10 pcs\r\n")
+    assert "1 × 10 pcs, stable" in explain(path).stdout
 
 
 GG = b"     0.00 GN\r\n-  450.38 GN\r\n    10.30 GN\r\n    0.000 g \r\n-  29.182 g \r\n    0.665 g \r\n"
