@@ -339,8 +339,14 @@ def _without_crumbs(vertices: Floats, faces: Integers, log: _Log) -> Integers:
     share = np.bincount(component, area) / area.sum()
     large = np.flatnonzero(share >= min(CRUMB, share.max()))
     bounds = [(corners[component == k].min(axis=(0, 1)), corners[component == k].max(axis=(0, 1))) for k in large]
-    largest = bounds[int(np.argmax(share[large]))]
-    if any(not _boxes_meet(np.array(each), np.array(largest)) for each in bounds):
+    main = int(np.argmax(share[large]))
+    apart = [k for k, each in zip(large, bounds, strict=True) if not _boxes_meet(np.array(each), np.array(bounds[main]))]
+    if apart:
+        upright = vertices @ log.turn.T
+        parts = [(faces[component == large[main]], faces[component == k]) for k in apart]
+        rings = [_missing_ring(upright, *pair, float(upright[faces, 2].min())) for pair in parts]
+        if all(rings):
+            raise _missing_wall(log, [ring for ring in rings if ring], upright, faces, boundary_loops(faces))
         sizes = ", ".join(" × ".join(f"{1e3 * x:.0f}" for x in high - low) + " mm" for low, high in bounds[:4])
         raise VesselError(f"{log.path.name}: {len(large)} bodies ({sizes}); a vessel is one: save it alone")
     if len(large) < len(share):

@@ -434,6 +434,7 @@ def glass(
         ("inner wall", 300.0, "300° around the axis (30° to 330° from x), 4 to 95 mm above the underside"),
         ("inner wall", 345.0, "345° around the axis (30° to 15° from x), 4 to 95 mm above the underside"),
         ("inner wall", 360.0, "all around the axis, 4 to 95 mm above the underside"),
+        ("outer wall", 360.0, "all around the axis, 0 to 95 mm above the underside"),
         ("rim", 60.0, "60° around the axis (30° to 90° from x), 70 to 95 mm above the underside"),
         ("rim", 10.0, "10° around the axis (30° to 40° from x), 70 to 95 mm above the underside"),
         ("rim of a sheet", 60.0, "60° around the axis (30° to 90° from x), 66 to 91 mm above the underside"),
