@@ -124,14 +124,19 @@ class _Labware:
                 raise DecantError(f"{path}: is a labware definition of schema 1; 2 and 3 can be read")
             schema, wells, meta = labware["schemaVersion"], labware["wells"], labware["metadata"]
             category, name = str(meta["displayCategory"]), str(meta["displayName"])
-            cells = {key: tuple(float(well[axis]) for axis in ("x", "y", "z", "depth")) for key, well in wells.items()}
+            values = {(key, axis): well[axis] for key, well in wells.items() for axis in ("x", "y", "z", "depth")}
+            for (key, axis), value in values.items():
+                if value is None:
+                    raise ValueError(f"{axis} of {key} is null")
+            cells = {key: tuple(float(values[key, axis]) for axis in ("x", "y", "z", "depth")) for key in wells}
             tips = bool(labware.get("parameters", {}).get("isTiprack"))
             if not all(map(math.isfinite, chain.from_iterable(cells.values()))):
                 raise ValueError("a length is no number")
         except (ValueError, TypeError, KeyError, AttributeError) as error:
+            reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
             raise DecantError(
                 f"{path}: should be a labware definition of Opentrons with 'schemaVersion', 'metadata' and 'wells', "
-                f"each with x, y, z and depth ({type(error).__name__}: {error})"
+                f"each with x, y, z and depth ({reason})"
             ) from None
         if schema not in (2, 3):
             raise DecantError(f"{path}: has schemaVersion {schema!r}; 2 and 3 can be read")

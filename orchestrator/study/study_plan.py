@@ -241,7 +241,8 @@ def cells_of(study: StudyPlan) -> tuple[StudyCell, ...]:
                             "pours", compared.plan.design_simulations, compared.pours, **place, strategy=compared.label
                         ),
                     )
-                add("calibration", spent + study.pour_count, 0, *made_of, **place, strategy=compared.label)
+                scored = 2 * study.pour_count  # θ* and the uncalibrated θ on each pour
+                add("calibration", spent + scored, 0, *made_of, **place, strategy=compared.label)
             for deployment in (a for a in study.deployments if number <= a.repetitions):
                 plan = deployment.plan
                 theta = f"calibration.{level.name}.C4.{number:02d}"

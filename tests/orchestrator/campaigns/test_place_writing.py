@@ -140,6 +140,7 @@ def test_public_racks_are_read(name: str, tmp_path: Path) -> None:
         ({**tubes(), "schemaVersion": 1}, "has schemaVersion 1; 2 and 3 can be read"),
         ({"ordering": []}, "should be a labware definition of Opentrons with 'schemaVersion'"),
         (_well("A1", depth="deep"), "each with x, y, z and depth"),  # type: ignore[arg-type]
+        (_well("A1", depth=None), r"depth of A1 is null"),  # type: ignore[arg-type]
         ("{", "should be a labware definition of Opentrons"),
         (_mirrored("y"), "the rows of 'six tubes' are counted from the wrong side: seen from above, A1 is at the back"),
         (_mirrored("x"), "the columns of 'six tubes' are counted from the wrong side"),

@@ -116,6 +116,8 @@ def test_killed_in_the_middle_it_goes_on_and_comes_to_what_an_undisturbed_one_co
     assert all(one.results["calibration"].simulations == 4 * 4 for one in scored)
     # θ* and the uncalibrated θ, on six pours each
     assert all(one.simulations == 2 * 6 for one in scored), "the grid was simulated again"
+    planned = {cell.id: cell.simulations for cell in cells if cell.kind == "calibration"}
+    assert {name: results[name].simulations for name in planned} == planned, "the estimate counts other simulations"
     assert scored[0].results["calibration"].trials != scored[1].results["calibration"].trials
     splits = [[p.split for p in results[f"pours.small.0{n}"].results["pours"].pours] for n in (1, 2)]
     actions = [[p.action for p in results[f"pours.small.0{n}"].results["pours"].pours] for n in (1, 2)]
