@@ -187,7 +187,7 @@ class DialectFit:
             self._add_reading(reply)
 
     def lacks_only_damaged_lines(self, best: DialectFit) -> bool:
-        """Whether the lines that the best dialect reads in addition are few, and have other lengths than whole lines."""
+        """Whether the lines that the best dialect reads in addition are few, and not as long as whole lines."""
         return self.weights >= MOSTLY * best.weights and self._valid.isdisjoint(self._invalid)
 
     def _add_reading(self, reading: Reading) -> None:

@@ -340,7 +340,9 @@ def _without_crumbs(vertices: Floats, faces: Integers, log: _Log) -> Integers:
     large = np.flatnonzero(share >= min(CRUMB, share.max()))
     bounds = [(corners[component == k].min(axis=(0, 1)), corners[component == k].max(axis=(0, 1))) for k in large]
     main = int(np.argmax(share[large]))
-    apart = [k for k, each in zip(large, bounds, strict=True) if not _boxes_meet(np.array(each), np.array(bounds[main]))]
+    apart = [
+        k for k, each in zip(large, bounds, strict=True) if not _boxes_meet(np.array(each), np.array(bounds[main]))
+    ]
     if apart:
         upright = vertices @ log.turn.T
         parts = [(faces[component == large[main]], faces[component == k]) for k in apart]

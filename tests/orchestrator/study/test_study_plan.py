@@ -27,7 +27,9 @@ def test_the_paper_study_has_the_repetitions_that_it_promises() -> None:
         assert count["pours", "", level] == 6
         for strategy in ("D1-uncalibrated", "D1-15", "D2", "D3"):
             assert count["deployment", strategy, level] == 3 * 6
-    spent = {strategy: sum(c.simulations - 2 * 40 for c in cells if c.strategy == strategy) for strategy in ("C2", "C3")}
+    spent = {
+        strategy: sum(c.simulations - 2 * 40 for c in cells if c.strategy == strategy) for strategy in ("C2", "C3")
+    }
     assert spent == {"C2": 3 * 504, "C3": 3 * 1652}
     assert [c.simulations for c in cells if c.kind == "grid"] == [100 * 40]
 

@@ -93,7 +93,7 @@ def test_a_fault_of_sartorius_may_have_one_letter() -> None:
     assert SBI.decode(b"   E 054      ") == Reading(ReadingStatus.ERROR, detail="error 054")
 
 
-@pytest.mark.parametrize("dialect", (KCP, KERN_SWT, SBI, A_AND_D, KERN_CONTINUOUS), ids=lambda dialect: dialect.name)
+@pytest.mark.parametrize("dialect", [KCP, KERN_SWT, SBI, A_AND_D, KERN_CONTINUOUS], ids=lambda dialect: dialect.name)
 def test_a_capture_with_damaged_lines_lists_the_dialect_of_its_whole_lines(dialect: Dialect) -> None:
     weights = [f"{10.37 + 12.5 * i:.2f}" for i in range(20)]
     lines = [line_of(dialect, weight) for weight in weights]
