@@ -280,9 +280,9 @@ def draw_rack(dispensed: Dispensed, liquids: Sequence[str]) -> RackDrawing:
     places = _grid([cup.position for cup in dispensed.cups])
     requested = {dose.number: dose.wanted_g for dose in dispensed.doses}
     columns, rows = (1 + max(place[k] for place in places.values()) for k in (0, 1))
-    width, bottom = max(1.6 * columns + 0.1, 4.9), 0.5 + 2.0 * rows
     full = sum(cup.state == "full" for cup in dispensed.cups)
     title = f"{full} of {len(dispensed.cups)} cups are full: amounts, and differences from the table [g]"
+    width, bottom = max(1.6 * columns + 0.1, 0.2 + 0.077 * len(title)), 0.5 + 2.0 * rows
     lines, texts, labels = list[RackLine](), [RackText((0.1, 0.25), title, size=0.15, side="left")], list[RackText]()
     for cup in dispensed.cups:
         column, row = places[cup.position]

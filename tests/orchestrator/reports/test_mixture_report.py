@@ -127,6 +127,14 @@ def test_figure_and_svg_have_the_same_texts_in_the_same_places() -> None:
         assert (x, y) == pytest.approx(of_figure[text], abs=0.06)  # y is of the baseline
 
 
+def test_no_text_of_a_rack_of_one_cup_is_cut_off() -> None:
+    figure = draw_rack(PARTLY.model_copy(update={"cups": PARTLY.cups[:1]}), ["oil"]).figure()
+    figure.canvas.draw()
+    extents = {text.get_text(): text.get_window_extent() for text in figure.axes[0].texts}
+    cut = [text for text, extent in extents.items() if extent.x0 < 0.0 or extent.x1 > figure.bbox.x1]
+    assert cut == []
+
+
 def test_a_cup_that_misses_a_tolerance_and_one_of_unknown_content_stand_out() -> None:
     missed = PARTLY.cups[0].model_copy(update={"state": "missed"})
     lost = DOSES[1].model_copy(update={"received_g": None, "outcome": "unknown"})
