@@ -19,6 +19,7 @@ import time
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ import pytest
 from actors.arm.planning.kinematics import pourer_motion
 from actors.arm.ur_settings import UrArmSettings
 from actors.balance.balance_settings import SerialBalanceSettings
+from actors.bench.dose_procedure import DoseProcedure
 from actors.bench.virtual_bench import BenchEmulators
 from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, PourProgress, UnknownPourError
 from actors.laboratory_settings import LaboratorySettings, TrueLiquid
@@ -216,6 +218,26 @@ async def test_a_dose_over_a_balance_that_is_read_each_second(open_stage: OpenSt
         assert 1e3 * about["received"] == pytest.approx(50, abs=4.0)
         assert about["received"] == pytest.approx(about["true"], abs=0.5e-3)
         assert 0.9 < float(np.median(np.diff(about["read_at"]))) < 1.2
+
+
+async def test_a_receiver_settles_by_the_clock_of_the_bench_if_that_is_slower_than_the_wall() -> None:
+    """On a busy machine, and with an emulated Franka, the zero was a reading of the rise: 'receiver missing'."""
+    begin = time.monotonic()
+
+    class Quarter:
+        @property
+        def now(self) -> float:
+            return 0.25 * (time.monotonic() - begin)
+
+    procedure: Any = object.__new__(DoseProcedure)
+    procedure._scale = 1.0
+    procedure._setup = SimpleNamespace(ground_truth=SimpleNamespace(clock=Quarter()))
+    procedure._readings = SimpleNamespace(all=[])
+    waiting = asyncio.ensure_future(procedure._readings_for(0.1, 2))
+    await asyncio.sleep(0.11)
+    procedure._readings.all += [1.0, 2.0]
+    await waiting
+    assert procedure._now() >= 0.1
 
 
 @pytest.mark.slow
