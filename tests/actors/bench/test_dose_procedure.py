@@ -234,7 +234,7 @@ async def test_a_receiver_settles_by_the_clock_of_the_bench_if_that_is_slower_th
     procedure._setup = SimpleNamespace(ground_truth=SimpleNamespace(clock=Quarter()))
     procedure._readings = SimpleNamespace(all=[])
     waiting = asyncio.ensure_future(procedure._readings_for(0.1, 2))
-    await asyncio.sleep(0.11)
+    await asyncio.sleep(0.11)  # longer than the wait by the wall clock, shorter than by the bench's
     procedure._readings.all += [1.0, 2.0]
     await waiting
     assert procedure._now() >= 0.1
