@@ -210,7 +210,8 @@ def _bilinear(table: Floats, row: Floats, column: Floats) -> Floats:
     """Values of a table at fractional places, clamped to it, elementwise."""
     # (1 − u) ((1 − v) t_ij + v t_i,j+1) + u (…)_i+1, in place where it can be: this is half of a simulated dose
     rows, columns = table.shape
-    row, column = row.clip(0.0, rows - 1.000001), column.clip(0.0, columns - 1.000001)
+    row = np.minimum(np.maximum(row, 0.0), rows - 1.000001)
+    column = np.minimum(np.maximum(column, 0.0), columns - 1.000001)
     place, j = row.astype(np.int64), column.astype(np.int64)
     u, v = row - place, column - j
     place *= columns

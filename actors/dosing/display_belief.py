@@ -18,6 +18,7 @@ Limitations: a display that moves by noise while it is held counts as new.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -162,10 +163,7 @@ class Repeats:
 
     def weights(self, state: int | None = None) -> Floats:
         """Probabilities of `REPEATS`."""
-        log = self._log[self._state if state is None else state]
-        weights: Floats = np.exp(log - log.max())
-        weights /= weights.sum()
-        return weights
+        return _normalised(self._log[self._state if state is None else state])
 
     @property
     def next(self) -> float:
@@ -202,12 +200,21 @@ class Repeats:
     def in_a_row(self, chance: float) -> int:
         """Number of repeated readings that are followed by a further one with less than a probability."""
         # P(n repeats) ≤ start · on^(n − 1) < chance, hence n = 1 + ⌈log(chance / start) / log on⌉
-        start, on = (self._upper(state) for state in (0, 1))
+        start, on = (_upper(self._log[state].tobytes()) for state in (0, 1))
         return 1 + max(math.ceil(math.log(chance / start) / math.log(on)), 0) if start > chance else 0
 
-    def _upper(self, state: int) -> float:
-        weights = self.weights(state)
-        return float(REPEATS[min(int(np.searchsorted(np.cumsum(weights), 0.8)), len(REPEATS) - 1)])
+
+@functools.lru_cache(maxsize=8)
+def _upper(log: bytes) -> float:
+    """The probability of a repeat that is exceeded with 20 %: asked many times between two readings."""
+    weights = _normalised(np.frombuffer(log))
+    return float(REPEATS[min(int(np.searchsorted(np.cumsum(weights), 0.8)), len(REPEATS) - 1)])
+
+
+def _normalised(log: Floats) -> Floats:
+    weights: Floats = np.exp(log - log.max())
+    weights /= weights.sum()
+    return weights
 
 
 def _log_beta(a: float, b: float) -> Floats:

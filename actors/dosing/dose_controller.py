@@ -392,10 +392,11 @@ class DoseController:
         else:
             self._estimator.advance(time, tilt)
             if self.phase is not DosePhase.DONE and seconds > 0.0:
+                amount = float(self._estimator.mass.mean())
                 for stream in (self._latest, self._usual):
-                    stream.advance(seconds, tilt, self.amount[0])
+                    stream.advance(seconds, tilt, amount)
                 if self.phase is not DosePhase.SETTLE:
-                    self._departed = max(self._departed, self.amount[0])
+                    self._departed = max(self._departed, amount)
         if pours and self.flow > 0.0:
             self._readings.track_zero(seconds)
         self._arm.arrive(time, tilt)
