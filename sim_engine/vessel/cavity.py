@@ -72,7 +72,9 @@ def flood(free: NDArray[np.bool_], sealed: NDArray[np.bool_] | None = None) -> C
             both = (layer > 0) & (below > 0)
             if sealed is not None:
                 both &= ~sealed[:, :, k - 1]
-            for upper, lower in np.unique(np.column_stack([layer[both], below[both]]), axis=0).tolist():
+            # a pair as one number: numpy sorts rows ten times as slowly
+            pairs = np.unique(layer[both].astype(np.int64) * free[:, :, k].size + below[both])
+            for upper, lower in zip(*(part.tolist() for part in np.divmod(pairs, free[:, :, k].size)), strict=True):
                 neighbours[(k, upper)].add((k - 1, lower))
                 neighbours[(k - 1, lower)].add((k, upper))
     levels = _levels(open_parts, neighbours)
