@@ -206,13 +206,13 @@ class DialectFit:
 def best_fits(lines: Sequence[bytes]) -> list[DialectFit]:
     """Decode lines in every installed dialect; return those that read the most weights and understand the most lines.
 
-    A strict dialect fits as well if it refuses only damaged lines.
+    A strict dialect fits as well if it refuses only damaged lines; what others read in these is no weight.
 
     Args:
         lines: as they came, without their ends.
 
     Returns:
-        Fits of equal quality, that with the most weights first; none if no dialect reads a weight.
+        Fits of equal quality, that which refuses the most damaged lines first; none if no dialect reads a weight.
     """
     fits = []
     for dialect in dialects().values():
@@ -225,7 +225,7 @@ def best_fits(lines: Sequence[bytes]) -> list[DialectFit]:
     best = fits[0]
     equal = (best.weights, best.understood)
     alike = [fit for fit in fits if (fit.weights, fit.understood) == equal or fit.lacks_only_damaged_lines(best)]
-    return alike if best.weights else []
+    return sorted(alike, key=lambda fit: fit.weights) if best.weights else []
 
 
 def explain_capture(capture: Capture) -> tuple[list[str], str | None]:

@@ -99,5 +99,5 @@ def test_a_capture_with_damaged_lines_lists_the_dialect_of_its_whole_lines(diale
     lines = [line_of(dialect, weight) for weight in weights]
     cut = lines[3].index(b"7")  # the last digit
     fits = best_fits([*lines[:5], lines[3][:cut] + lines[3][cut + 1 :], *lines[5:], lines[3][:-1]])
-    fit = next(fit for fit in fits if fit.dialect is dialect)
-    assert set(fit.reads) == {f"{weight} g" for weight in weights}
+    assert fits[0].dialect is dialect
+    assert set(fits[0].reads) == {f"{weight} g" for weight in weights}
