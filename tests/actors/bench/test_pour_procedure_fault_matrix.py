@@ -45,6 +45,10 @@ STANDING = 2.0
 for a busy machine."""
 
 
+LOOK = 0.05
+"""Between two looks at the phase [s of the clock], which waits for a busy machine: a fault strikes in its phase."""
+
+
 @dataclass
 class Fault:
     """Something that goes wrong, and how it is put right.
@@ -153,22 +157,26 @@ class Recorder:
 async def strike_in(stage: Stage, phase: str, fault: Fault, seen: list[Any], pour: asyncio.Task[Any]) -> float:
     """Have a fault happen in the middle of a phase; the controller's time then [s]."""
     spans = {name: (begin, end) for name, begin, end in arm_kind(SPEC.arm).plan(SCENE, SLOWLY).phases}
-    end = time.monotonic() + PATIENCE
-    while True:
-        assert time.monotonic() < end, f"never came to {phase}"
-        assert not pour.done(), f"the pour ended before {phase} was seen: {pour.result()}"
-        state = await stage.bench.arm.state()
-        if phase == "weigh" and seen and seen[-1].checkpoint in ("settle", "weigh"):
-            break
-        if phase == "approach" and state.phase == phase and state.fraction > 0.2:
-            break
-        if phase in spans and state.phase == phase:
-            begin, until = spans[phase]
-            if state.time > begin + 0.2 * (until - begin):
+    end, clock = time.monotonic() + PATIENCE, stage.bench.ground_truth.clock
+    try:
+        while True:
+            assert time.monotonic() < end, f"never came to {phase}"
+            assert not pour.done(), f"the pour ended before {phase} was seen: {pour.result()}"
+            clock.promise("dose", LOOK)
+            state = await stage.bench.arm.state()
+            if phase == "weigh" and seen and seen[-1].checkpoint in ("settle", "weigh"):
                 break
-        await asyncio.sleep(0.005)
-    at = await stage.now()
-    await fault.strike(stage)
+            if phase == "approach" and state.phase == phase and state.fraction > 0.2:
+                break
+            if phase in spans and state.phase == phase:
+                begin, until = spans[phase]
+                if state.time > begin + 0.2 * (until - begin):
+                    break
+            await asyncio.sleep(0.005)
+        at = await stage.now()
+        await fault.strike(stage)
+    finally:
+        clock.withdraw("dose")
     return at
 
 
