@@ -154,6 +154,11 @@ class Recorder:
                 self.joints.append(q)
 
 
+def left_home(joints: tuple[float, ...]) -> bool:
+    """Whether the arm has moved: the driver's first state of a motion is that of the motion before."""
+    return bool(joints) and float(np.max(np.abs(np.subtract(joints, SPEC.arm.home.angles)))) > 0.05
+
+
 async def strike_in(stage: Stage, phase: str, fault: Fault, seen: list[Any], pour: asyncio.Task[Any]) -> float:
     """Have a fault happen in the middle of a phase; the controller's time then [s]."""
     spans = {name: (begin, end) for name, begin, end in arm_kind(SPEC.arm).plan(SCENE, SLOWLY).phases}
@@ -166,7 +171,7 @@ async def strike_in(stage: Stage, phase: str, fault: Fault, seen: list[Any], pou
             state = await stage.bench.arm.state()
             if phase == "weigh" and seen and seen[-1].checkpoint in ("settle", "weigh"):
                 break
-            if phase == "approach" and state.phase == phase and state.fraction > 0.2:
+            if phase == "approach" and state.phase == phase and state.fraction > 0.2 and left_home(state.joints):
                 break
             if phase in spans and state.phase == phase:
                 begin, until = spans[phase]
