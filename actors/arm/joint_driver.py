@@ -64,7 +64,7 @@ STANDING = 4e-3
 """Joints that change by less than this per second stand still [rad/s]."""
 
 SILENCE = 0.5
-"""Time without a newer reading after which a robot counts as lost [s]; ten times as long beside an emulator."""
+"""Time without a newer reading after which a robot counts as lost [s of the clock]."""
 
 LATEST = 0.02
 """Time within which a driver reads again during a motion; the clock of a virtual bench waits for it [s]."""
@@ -418,18 +418,17 @@ class JointArm:
 
     def _readings(self, times: list[float], joints: list[FloatArray]) -> Iterator[JointReading]:
         """Readings of a motion, each newer than the one before; their times count from its begin."""
-        begun, arrived = self._last_time, time.monotonic()
-        patience = SILENCE * self._clock.patience
+        begun, arrived = self._last_time, self._clock.now
         while True:
             reading = self._read()
             now = reading.time - begun
             if now > times[-1]:
                 times.append(now)
                 joints.append(reading.joints)
-                arrived = time.monotonic()
+                arrived = self._clock.now
                 self._clock.promise("arm", self._spec.on_clock(LATEST))
                 yield replace(reading, time=now)
-            elif time.monotonic() - arrived > patience:
+            elif self._clock.now - arrived > SILENCE:
                 raise ConnectionError("the robot reports nothing new")
             time.sleep(PERIOD)
 

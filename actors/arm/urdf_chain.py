@@ -19,6 +19,7 @@ from __future__ import annotations
 import importlib.util
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
@@ -148,7 +149,8 @@ class ChainModel(ArmModel):
         gripper = LinkCapsule("gripper", flange, flange + 1, GRIPPER_RADIUS)
         near = (*(link for joint, link in made if joint >= count - 1), gripper)
         self.links = (*(link for joint, link in made if joint >= 2), gripper)
-        self.bars = (*(link for _, link in made), gripper)
+        bars = (*(link for _, link in made), gripper)
+        self.bars = (replace(bars[0], first=0), *bars[1:])
         body = [(joint, link) for joint, link in made if joint <= count - 3]
         self.body = tuple(link for _, link in body)
         self.hand = tuple(near if joint <= count - 4 else () for joint, _ in body)

@@ -28,7 +28,10 @@ FloatArray = NDArray[np.float64]
 MODELS = ("fr3", "panda")
 
 ANSWER_TIME = 1.0
-"""Longest wait for the worker's reply [s], ten times as long on a virtual bench."""
+"""Longest wait for the worker's reply [s of the clock], ten times as long on a virtual bench."""
+
+POLL = 0.1
+"""Time between two looks at the clock in that wait [s]."""
 
 OPEN_TIME = 20.0
 """Longest wait for the client library to connect [s]."""
@@ -124,7 +127,10 @@ class FrankaRobot:
             connection, address = worker.connection, self._spec.address
             try:
                 connection.send((name, arguments))
-                replied = connection.poll(deadline * device_clock(self._spec.clock).patience)
+                clock = device_clock(self._spec.clock)
+                end = clock.now + deadline * clock.patience
+                while not (replied := connection.poll(POLL)) and clock.now < end:
+                    pass
                 reply = connection.recv() if replied else None
             except (OSError, EOFError) as error:
                 connection.close()

@@ -3,7 +3,8 @@
 The simulated robot speaks libfranka's protocol at its address. The devices of the bench wait for it, and it for them:
 while a client moves it, their clock is the simulation's, which may be slower than the wall clock. While it stands,
 their clock is the wall clock, and the robot's own time runs slower, since nothing happens in it. A client may be late
-by `LATE`, then the robot waits for it, since the host may be slow; a real one stops.
+by `LATE`, then the robot waits for it, since the host may be slow; a real one stops. After `LONGEST_STAND` it hangs,
+and a reflex stops the robot.
 
 A line of JSON is answered by a line of JSON: `{"since": t}` by the joints since a time of the robot, `{"pace": s}` sets
 the bench seconds per second of the clock, `{"orders": ["trip"]}` is a fault.
@@ -14,6 +15,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
+import select
+import socket
 import sys
 import threading
 import time
@@ -31,16 +35,13 @@ from franky_sim.franka_robot_protocol import (
 )
 from franky_sim.mujoco_simulator import MujocoSimulator
 
-from actors.runtime.bench_clock import SharedClock
+from actors.runtime.bench_clock import LONGEST_STAND, SharedClock
 
 TICK = 1e-3
 """Control cycle of the robot [s]."""
 
 LATE = 10
 """Cycles by which the client's commands may be late before the robot waits for them."""
-
-HANGS = 2.0
-"""Time of waiting after which its client hangs, and a reflex stops it [s]."""
 
 EVERY = 8
 """Cycles between two samples of the history."""
@@ -53,7 +54,7 @@ SILENCE = 0.2
 libfranka counts a second of silence as a lost connection."""
 
 REMINDER = 0.05
-"""Wall time without a new state after which the last one is sent again [s]; without any, a client gives up."""
+"""Wall time between two reminders of a client [s]."""
 
 KEPT = 600.0
 """Time for which samples are kept [s]."""
@@ -68,8 +69,8 @@ class Ports(franka_robot_server.FrankaRobotServer):  # type: ignore[misc]  # it 
     reflex = unplugged = False
     quiet = 0
     """States that were sent since the last command of a motion; 0 before its first one."""
-    sent = 0.0
-    """Wall time at which a state was sent [s]."""
+    reminder: socket.socket
+    """To the process that runs `_remind`."""
 
     def start_motion(self, *arguments: Any) -> None:
         """Begin a motion."""
@@ -83,15 +84,16 @@ class Ports(franka_robot_server.FrankaRobotServer):  # type: ignore[misc]  # it 
     def send_state(self) -> None:
         """Send the state to a client."""
         super().send_state()
-        self.sent = time.monotonic()
         self.quiet += self.quiet > 0
+        if self._FrankaServer__message_id == 1:
+            size = 8 + len(self._get_state_bytes())
+            client = json.dumps([size, self._FrankaServer__client_address, self._FrankaServer__client_udp_port])
+            socket.send_fds(self.reminder, [client.encode()], [self._FrankaServer__udp_socket.fileno()])
 
-    def remind(self) -> None:
-        """Send the last state again, if a client has had none for a while."""
-        if self._FrankaServer__message_id and time.monotonic() > self.sent + REMINDER:
-            self._FrankaServer__message_id -= 1
-            super().send_state()
-            self.sent = time.monotonic()
+    def reset_state(self) -> None:
+        """Let go of the client."""
+        super().reset_state()
+        self.reminder.send(b"null")
 
     @property
     def late(self) -> bool:
@@ -155,7 +157,6 @@ class VirtualFranka:
             waits = time.monotonic() + longest
             while not (passes := self._clock.may_pass(period)) and time.monotonic() < waits:
                 self._clock.advance(0.0)
-                self._ports.remind()
                 time.sleep(2e-4)
             self._cycle()
             self._clock.advance(period if passes else 0.0)
@@ -184,11 +185,10 @@ class VirtualFranka:
             waits = time.monotonic() + SILENCE
             while (late := ports.late) and time.monotonic() < waits:
                 self._clock.advance(0.0)
-                ports.remind()
                 time.sleep(2e-4)
                 ports.process_commands()
             self._waited = self._waited + SILENCE if late else 0.0
-            if self._waited >= HANGS:
+            if self._waited >= LONGEST_STAND:
                 ports.trip()
         self._simulator.step()
         ports.send_state()
@@ -211,6 +211,28 @@ class VirtualFranka:
         self._ended.set()
 
 
+def _remind(channel: socket.socket) -> None:
+    """Send a client states that it skips, with an old number; without any for a second, it gives up.
+
+    This is a process of its own, since a simulator that works all the time waits for a processor of a busy host for
+    longer than that. A new client is a message with its port; it ends with the channel.
+    """
+    client: tuple[socket.socket, bytes, tuple[Any, ...]] | None = None
+    while True:
+        if not select.select([channel], [], [], REMINDER)[0]:
+            if client is not None:
+                with contextlib.suppress(OSError):
+                    client[0].sendto(*client[1:])
+            continue
+        text, handles, *_ = socket.recv_fds(channel, 200, 1)
+        if not text:
+            return
+        client = None
+        if handles:
+            size, *address = json.loads(text)
+            client = socket.socket(fileno=handles[0]), bytes(size), tuple(address)
+
+
 def main() -> None:
     """Serve until the input ends."""
     parser = argparse.ArgumentParser()
@@ -220,6 +242,14 @@ def main() -> None:
     parser.add_argument("--joints", required=True)
     chosen = parser.parse_args()
     joints = [float(q) for q in chosen.joints.split(",")]
+    Ports.reminder, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    if not os.fork():
+        os.setsid()  # a group of its own for the scheduler
+        Ports.reminder.close()
+        os.closerange(0, 3)
+        _remind(channel)
+        os._exit(0)
+    channel.close()
     with contextlib.redirect_stdout(sys.stderr), MujocoSimulator() as simulator:
         simulator.add_robot(initial_q=joints)
         robot = VirtualFranka(simulator, chosen.address, SharedClock(chosen.clock), chosen.time_scale)

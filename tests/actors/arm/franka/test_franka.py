@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import random
+import signal
 import subprocess
 import sys
 import time
@@ -220,8 +221,8 @@ franka_process.main()
 """
 
 
-def test_a_client_is_not_lost_while_the_clock_of_the_bench_stands(tmp_path: Path) -> None:
-    """The liquid is computed for seconds, or the host is slow; libfranka waits for one second."""
+def test_a_client_is_not_lost_while_the_clock_of_the_bench_or_the_simulator_stands(tmp_path: Path) -> None:
+    """The liquid is computed for seconds, or a busy host gives the simulator no time; libfranka waits for a second."""
     SharedClock.create(tmp_path / "clock")
     clock, address = SharedClock(tmp_path / "clock"), f"127.77.{random.randint(0, 254)}.{random.randint(1, 254)}"
     joints = "--joints=" + ",".join(map(repr, SETTINGS.home_joints))
@@ -238,6 +239,10 @@ def test_a_client_is_not_lost_while_the_clock_of_the_bench_stands(tmp_path: Path
         assert robot.state.time.to_sec() < stood + 0.1
         clock.withdraw("liquid")
         until(lambda: robot.state.time.to_sec() > stood + 0.2, "it does not go on")
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(3.0)
+        process.send_signal(signal.SIGCONT)
+        until(lambda: robot.state.time.to_sec() > stood + 0.4, "it does not go on after the simulator stood")
         assert robot.is_in_control
         robot.stop()
         process.stdin.close()  # type: ignore[union-attr]

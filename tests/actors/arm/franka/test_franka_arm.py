@@ -7,6 +7,7 @@ import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import actors.arm.franka
@@ -109,6 +110,15 @@ def test_the_arm_makes_the_fastest_pour_that_is_searched(tmp_path: Path) -> None
     fastest = settings.tilt_speed_limit
     path = FrankaKind(settings).plan(scene, dataclasses.replace(ACTION, height=0.11, angular_velocity=fastest))
     assert path.report.tilt_speed == pytest.approx(fastest, rel=1e-3)
+
+
+def test_the_pictures_show_the_base_where_the_robot_stands(tmp_path: Path) -> None:
+    pytest.importorskip("pinocchio")
+    pytest.importorskip("franky_sim")
+    arm = load_laboratory(changed(tmp_path)).arm
+    assert isinstance(arm, FrankaSettings)
+    bars = FrankaKind(arm).figure().ends(np.array(arm.home_joints))
+    assert bars[0, 0] == pytest.approx([0.0, 0.6, -0.1])  # of a receiver at x = 600 mm, z = 100 mm
 
 
 def test_a_gripper_with_a_server_of_its_own_fits_beside_a_franka(tmp_path: Path) -> None:
