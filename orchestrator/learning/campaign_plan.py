@@ -519,8 +519,8 @@ class DispensePlan:
         doses: in the order of pouring.
         refill_below: a source that would hold less after a dose is not used before it is filled again [kg].
         as_left: whether the series begins with what earlier runs left in the sources; otherwise they are filled.
-        laboratory: part of the names under which the content of the sources is tracked; '': the run does not track it.
-        vessels: sources that are vessels of the station, with their ids.
+        laboratory: part of the names under which the content of the vessels is tracked; '' in an ordered pour.
+        vessels: sources, and the cup of an ordered pour, that are vessels of the station, with their ids.
         mixtures: cups of the doses; None: each dose has a receiver of its own.
     """
 
@@ -545,9 +545,14 @@ class DispensePlan:
         """The scene of a source and a receiver."""
         return next(s for s in self.scenes if (s.pourer.name, s.receiver.name) == (source, receiver))
 
-    def tracked(self, source: str) -> str:
-        """Name of a source in the account of the vessels: its id at the station, or laboratory and vessel."""
-        return self.vessels.get(source) or f"{self.laboratory}/{source}"
+    @property
+    def accounted(self) -> bool:
+        """Whether its run enters the contents in the account of the vessels."""
+        return bool(self.laboratory or self.vessels)
+
+    def tracked(self, name: str) -> str:
+        """Name of a source or cup in the account of the vessels: its id at the station, or laboratory and vessel."""
+        return self.vessels.get(name) or f"{self.laboratory}/{name}"
 
     def liquid(self, source: str) -> str:
         """Name of a source's liquid."""

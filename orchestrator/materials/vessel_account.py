@@ -10,9 +10,14 @@ content uncertain by its amount; one with unknown outcome makes it unknown until
 
 `composition` has the liquids of a vessel since it was empty, each with its mass as it was dosed.
 
-The command line, the library, runs and the daemon share the file. A vessel of the station has its id as its name, the
-source of a campaign 'LABORATORY/VESSEL'. `VesselAccount.follow` is a subscriber of a run
-(`orchestrator.records.events`). Entries have a key, so that the events of a resumed run are written once.
+A vessel has one name: its id at the station, or else its address 'LABORATORY/VESSEL', under which the laboratory's
+bench knows it. A vessel with an id that belongs at a place of a laboratory has an address, too: 'LABORATORY/PLACE'.
+Every function takes an address, and looks up in the file itself whose it is, so that a run at the terminal and an order
+of the daemon find the same cup. The file refuses an entry under the address of a vessel that has an id.
+
+The command line, the library, runs and the daemon share the file. `VesselAccount.follow` is a subscriber of a run
+(`orchestrator.records.events`). Entries have a key, so that the events of a resumed run are written once. A file of an
+earlier format is converted when it is opened.
 
 Limitations: liquids that were poured together become a mixture. Evaporation is not estimated. Of a campaign, the doses
 of `dispense` are in the account; the pourer of other campaigns is refilled by an operator.
@@ -33,6 +38,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict
 
 from actors.interfaces import LaboratoryError
+from actors.places import OUTSIDE
 from orchestrator.learning.campaign_plan import DispensePlan
 from orchestrator.learning.dispense import ENOUGH, KnownSource, left_after
 from orchestrator.learning.requests import Failed, Outcome, Pour, Poured
@@ -50,27 +56,51 @@ MIXTURE = "mixture"
 
 EntryKind = Literal["filled", "weighed", "begun", "poured", "unknown"]
 
-_SCHEMA = """
-create table if not exists entry (
+FORMAT = 1
+"""Version of the file (`user_version`). Files of the development versions of 0.3.0 and of 0.2.1 have 0."""
+
+LATEST = "id in (select max(id) from stand group by vessel)"
+
+_ADDRESS = "laboratory || '/' || home"
+
+_IDENTITY = f"coalesce((select vessel from stand where {LATEST} and {_ADDRESS} = ?1), ?1)"
+"""The name of the vessel that has a name or an address."""
+
+_RENAMED = f"exists (select 1 from stand where {LATEST} and {_ADDRESS} = new.vessel and vessel != new.vessel)"
+
+_SCHEMA = (
+    """create table if not exists entry (
     id integer primary key, key text unique not null, vessel text not null, t real not null, kind text not null,
     mass real, deviation real not null, liquid text not null, pour text not null, by text not null,
     note text not null, weighed real, knowledge text check (knowledge is null or json_valid(knowledge))
-) strict;
-create index if not exists entry_by_vessel on entry (vessel, id);
-create table if not exists stand (
-    id integer primary key, vessel text not null, t real not null, place text, by text not null, note text not null
-) strict;
-create table if not exists component (
+    ) strict""",
+    "create index if not exists entry_by_vessel on entry (vessel, id)",
+    """create table if not exists component (
     id integer primary key, vessel text not null, t real not null, liquid text not null, mass real,
     deviation real not null, source text not null
-) strict;
-create trigger if not exists entry_is_never_changed before update on entry begin
-    select raise(abort, 'account entries are append-only'); end;
-create trigger if not exists entry_is_never_deleted before delete on entry begin
-    select raise(abort, 'account entries are append-only'); end;
-"""
+    ) strict""",
+    """create table stand (
+    id integer primary key, vessel text not null, t real not null, laboratory text not null, home text not null,
+    place text, by text not null, note text not null
+    ) strict""",
+    "create index stand_by_vessel on stand (vessel, id)",
+    """create trigger if not exists entry_is_never_changed before update on entry begin
+    select raise(abort, 'account entries are append-only'); end""",
+    """create trigger if not exists entry_is_never_deleted before delete on entry begin
+    select raise(abort, 'account entries are append-only'); end""",
+    f"""create trigger entry_has_the_id_of_its_vessel before insert on entry when {_RENAMED} begin
+    select raise(abort, 'the vessel at this place has an id, and this entry does not name it'); end""",
+    f"""create trigger component_has_the_id_of_its_vessel before insert on component when {_RENAMED} begin
+    select raise(abort, 'the vessel at this place has an id, and this entry does not name it'); end""",
+)
+"""Of a new file, and of one of format 0, whose entries and components stay. A program that knows format 0 can't enter
+a motion in it, since it gives no `home`: one that runs while the file is converted stops before its next motion."""
 
-LATEST = "id in (select max(id) from stand group by vessel)"
+_PLACES_OF_FORMAT_0 = """insert into stand select id, vessel, t, substr(vessel, 1, instr(vessel, '/') - 1),
+    substr(vessel, instr(vessel, '/') + 1), place, by, note from former_stand"""
+
+SAME = 0.5e-3
+"""Largest difference between two accounts of one vessel, beyond their uncertainty [kg]."""
 
 LOCK_TIMEOUT = 1.0
 """Longest wait for another process that writes [s]."""
@@ -177,6 +207,7 @@ class VesselPlace:
     Attributes:
         vessel: its name.
         time: of the entry, seconds since 1970.
+        home: name under which the bench of its laboratory knows it: for a cup or source, the place where it belongs.
         place: name of the place; None: UNKNOWN, since a motion with it has begun and not ended.
         by: who made the entry; '' for a run.
         note: for people, such as the motion that was under way.
@@ -185,6 +216,7 @@ class VesselPlace:
 
     vessel: str
     time: float
+    home: str
     place: str | None
     by: str = ""
     note: str = ""
@@ -224,8 +256,8 @@ class Component:
     liquid: str
     mass: float | None
     deviation: float
-    source: str
-    time: float
+    source: str = ""
+    time: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -254,13 +286,26 @@ class VesselAccount:
             state: the directory; None: that of this machine's user.
 
         Raises:
-            OSError: the state directory can't be made.
+            OSError: the state directory can't be made, or the file is damaged or of a later version.
         """
         folder = state or state_directory()
         make_state_directory(folder)
-        return cls(folder / FILE_NAME)
+        account = cls(folder / FILE_NAME)
+        account.identity("")  # refuses the format of a later version before anything begins
+        return account
 
     # ---- reading
+
+    def identity(self, name: str) -> str:
+        """The vessel that has a name or an address.
+
+        Raises:
+            OSError: the file can't be read.
+        """
+        if not self._path.is_file():
+            return name
+        with self._connection() as connection:
+            return _identity(connection, name)
 
     def content(self, vessel: str) -> VesselContent | None:
         """The last entry of a vessel; None without any.
@@ -277,7 +322,7 @@ class VesselAccount:
         Raises:
             OSError: the file can't be read.
         """
-        return self._entries("where ? in ('', vessel) order by id desc limit ?", (vessel, count))
+        return self._entries(f"where ?1 = '' or vessel = {_IDENTITY} order by id desc limit ?2", (vessel, count))
 
     def all(self) -> list[VesselContent]:
         """The last entry of every vessel, by name.
@@ -285,7 +330,9 @@ class VesselAccount:
         Raises:
             OSError: the file can't be read.
         """
-        return self._entries("where id in (select max(id) from entry group by vessel) order by vessel", ())
+        addresses = f"select {_ADDRESS} from stand where {LATEST} and vessel != {_ADDRESS}"
+        last = "select max(id) from entry group by vessel"
+        return self._entries(f"where id in ({last}) and vessel not in ({addresses}) order by vessel", ())
 
     def _entries(self, condition: str, values: tuple[Any, ...]) -> list[VesselContent]:
         if not self._path.is_file():
@@ -353,9 +400,10 @@ class VesselAccount:
         self, kind: EntryKind, vessel: str, mass: float, deviation: float, liquid: str, by: str, note: str, key: str
     ) -> None:
         _check_stated(mass, deviation)
-        if mass == 0.0 and by and self.composition(vessel):
-            self.add_component(vessel, "", None, 0.0)  # a person has emptied it, or brought another one
         with self._writing() as connection:
+            vessel = _identity(connection, vessel)
+            if mass == 0.0 and by and _composition(connection, vessel):
+                _add_component(connection, Component("", None, 0.0), vessel)  # emptied by a person, or another one
             before = _last(connection, vessel)
             held = liquid or ("" if before is None else before.liquid)
             if mass > 0.0 and not held:
@@ -375,6 +423,7 @@ class VesselAccount:
             OSError: the file can't be written.
         """
         with self._writing() as connection:
+            vessel = _identity(connection, vessel)
             before = _last(connection, vessel) or _empty(vessel)
             entry = replace(before, time=time.time(), kind="unknown", mass=None, deviation=0.0, pour="", note="")
             _write(connection, f"unknown {vessel} {time.time_ns()}", entry)
@@ -427,6 +476,7 @@ class VesselAccount:
             OSError: the file can't be written.
         """
         with self._writing() as connection:
+            source, receiver = _identity(connection, source), _identity(connection, receiver)
             held, target = (_last(connection, name) or _empty(name) for name in (source, receiver))
             mixed = held.liquid if target.liquid in ("", held.liquid) else MIXTURE
             for before, change, sign, liquid, role in (
@@ -438,7 +488,11 @@ class VesselAccount:
                     before.vessel, time.time(), kind, mass, deviation, liquid, pour, by, note, before.weighed,
                     before.knowledge,
                 )  # fmt: skip
-                _write(connection, f"{pour} {role}", entry)
+                if _write(connection, f"{pour} {role}", entry) and role == "into" and held.liquid:
+                    parts = {part.liquid: part for part in _composition(connection, receiver)}
+                    earlier = parts.get(held.liquid, Component(held.liquid, 0.0, 0.0))
+                    _, mass, deviation = _after(earlier, change, sign)
+                    _add_component(connection, Component(held.liquid, mass, deviation, source), receiver)
 
     # ---- compositions
 
@@ -451,16 +505,7 @@ class VesselAccount:
         if not self._path.is_file():
             return []
         with self._connection() as connection:
-            if not connection.execute("select 1 from sqlite_master where name = 'component'").fetchone():
-                return []
-            empty = "select coalesce(max(id), 0) from component where vessel = ? and liquid = ''"
-            rows = connection.execute(
-                f"select liquid, mass, deviation, source, t from component where vessel = ? and id >= ({empty}) "
-                "order by id",
-                (vessel, vessel),
-            ).fetchall()
-        latest = {row[0]: Component(*row) for row in rows}  # a begun dose is followed by its outcome
-        return list(latest.values())
+            return _composition(connection, vessel)
 
     def add_component(self, vessel: str, liquid: str, mass: float | None, deviation: float, source: str = "") -> None:
         """Enter a liquid that was poured into a vessel, or that a dose of it begins; '' for the empty vessel.
@@ -475,10 +520,8 @@ class VesselAccount:
             OSError: the file can't be written.
         """
         with self._writing() as connection:
-            connection.execute(
-                "insert into component (vessel, t, liquid, mass, deviation, source) values (?, ?, ?, ?, ?, ?)",
-                (vessel, time.time(), liquid, mass, deviation, source),
-            )
+            source = _identity(connection, source)
+            _add_component(connection, Component(liquid, mass, deviation, source), _identity(connection, vessel))
 
     # ---- places
 
@@ -491,20 +534,30 @@ class VesselAccount:
         if not self._path.is_file():
             return {}
         with self._connection() as connection:
-            if not connection.execute("select 1 from sqlite_master where name = 'stand'").fetchone():
-                return {}
             origin = "select place from stand as former where former.vessel = stand.vessel and place is not null"
             rows = connection.execute(
-                f"select vessel, t, place, by, note, coalesce(({origin} order by id desc limit 1), '') from stand "
-                f"where {LATEST}"
+                "select vessel, t, home, place, by, note, "
+                f"coalesce(({origin} order by id desc limit 1), '') from stand where {LATEST}"
             ).fetchall()
         return {str(row[0]): VesselPlace(*row) for row in rows}
+
+    def stands(self, laboratory: str) -> dict[str, str | None]:
+        """The places of a laboratory's vessels, by the names that its bench has for them; None for UNKNOWN.
+
+        Raises:
+            OSError: the file can't be read.
+        """
+        if not self._path.is_file():
+            return {}
+        with self._connection() as connection:
+            of_laboratory = f"select home, place from stand where {LATEST} and laboratory = ?"
+            return dict(connection.execute(of_laboratory, (laboratory,)).fetchall())
 
     def put(self, vessel: str, place: str | None, *, by: str = "", note: str = "") -> None:
         """Enter where a vessel stands; None for UNKNOWN. The entry is on disk when this returns.
 
         Args:
-            vessel: 'LABORATORY/VESSEL'; places belong to the laboratory.
+            vessel: its address, which stays.
             place: name of the place; '' outside the cell.
             by: who corrected it; '' for a run.
             note: for people.
@@ -513,18 +566,44 @@ class VesselAccount:
             InvalidArgumentError: another vessel of the laboratory stands there.
             OSError: the file can't be written.
         """
-        laboratory = vessel.partition("/")[0]
+        laboratory, _, home = vessel.partition("/")
         with self._writing() as connection:
-            rows = connection.execute(f"select vessel, place from stand where {LATEST} and vessel != ?", (vessel,))
-            for other, taken in rows.fetchall():
-                if place and taken == place and str(other).partition("/")[0] == laboratory:
-                    raise InvalidArgumentError(
-                        f"{vessel}: {other} stands at '{place}' already; a place holds one vessel"
-                    )
-            connection.execute(
-                "insert into stand (vessel, t, place, by, note) values (?, ?, ?, ?, ?)",
-                (vessel, time.time(), place, by, note),
-            )
+            name = _identity(connection, vessel)
+            others = f"select vessel from stand where {LATEST} and laboratory = ? and place = ? and vessel != ?"
+            taken = connection.execute(others, (laboratory, place or None, name)).fetchone()
+            if taken is not None:
+                raise InvalidArgumentError(
+                    f"{vessel}: {taken[0]} stands at '{place}' already; a place holds one vessel"
+                )
+            _put(connection, name, (laboratory, home), place, by, note)
+
+    def assign(self, vessel: str, address: tuple[str, str], *, by: str = "") -> None:
+        """A vessel with an id belongs at a place from now on, and stands there.
+
+        The vessel without an id that the account has there is this one. If what the account has of both differs, the
+        content is UNKNOWN until it is weighed, and a liquid that either has is in it.
+
+        Args:
+            vessel: its id.
+            address: laboratory and place; both '' if it belongs nowhere.
+            by: who has put it there; '': it stands where the vessel without an id does.
+
+        Raises:
+            InvalidArgumentError: another vessel belongs there.
+            OSError: the file can't be written.
+        """
+        home = address[1]
+        with self._writing() as connection:
+            former = "/".join(address) if home else vessel
+            owner = _identity(connection, former)
+            if owner not in (vessel, former):
+                raise InvalidArgumentError(f"position {home} is taken by vessel {owner}; move that one first")
+            stood = connection.execute(f"select place, note from stand where {LATEST} and vessel = ?", (former,))
+            place, note = stood.fetchone() or (home, "")
+            if owner != vessel:
+                _take_over(connection, vessel, former, moved=place is None)
+                _put(connection, former, ("", ""), OUTSIDE, by, f"its id is {vessel}")
+            _put(connection, vessel, address, *((home, by, "") if by else (place, by, note)))
 
     # ---- entries of runs
 
@@ -555,6 +634,7 @@ class VesselAccount:
 
     def _note_dose(self, vessel: str, kind: EntryKind, left: KnownSource | None, key: str, liquid: str) -> None:
         with self._writing() as connection:
+            vessel = _identity(connection, vessel)
             before = _last(connection, vessel) or _empty(vessel)
             mass, deviation = (None, 0.0) if left is None else (left.mass, left.deviation)
             knowledge = before.knowledge if left is None or left.knowledge is None else left.knowledge
@@ -569,11 +649,8 @@ class VesselAccount:
         dose = pour.dose
         assert dose is not None
         assert dose.source is not None
-        cup, liquid, source = (
-            f"{plan.laboratory}/{dose.cup}",
-            plan.liquid(dose.source.name),
-            plan.tracked(dose.source.name),
-        )
+        cup, source = plan.tracked(dose.cup), plan.tracked(dose.source.name)
+        liquid = plan.liquid(dose.source.name)
         key = f"{key} into" if outcome is not None else f"{key} into begun"
         if self._entries("where key = ?", (key,)):
             return
@@ -633,7 +710,6 @@ class VesselAccount:
     def _writing(self) -> Iterator[sqlite3.Connection]:
         """One transaction: nobody else writes between the reading of a content and the entry that follows from it."""
         with self._connection() as connection:
-            connection.executescript(_SCHEMA)
             connection.execute("begin immediate")
             yield connection
 
@@ -641,9 +717,28 @@ class VesselAccount:
     def _connection(self) -> Iterator[sqlite3.Connection]:
         try:
             with contextlib.closing(sqlite3.connect(self._path, timeout=LOCK_TIMEOUT)) as connection, connection:
+                self._convert(connection)
                 yield connection
         except sqlite3.Error as error:
             raise OSError(f"{self._path}: {error}") from error
+
+    def _convert(self, connection: sqlite3.Connection) -> None:
+        """Create the tables, or convert those of the earlier format: all in one transaction, or nothing."""
+        if (version := _version(connection)) == FORMAT:
+            return
+        if version > FORMAT:
+            raise OSError(
+                f"{self._path}: the account of vessels was written in format {version}, and this version of Decant "
+                f"reads formats up to {FORMAT}; use the version that wrote it, or another state directory"
+            )
+        connection.execute("begin immediate")
+        if _version(connection) != FORMAT:  # no other process was first
+            former = connection.execute("select 1 from sqlite_master where name = 'stand'").fetchone()
+            renaming = ("alter table stand rename to former_stand",) if former else ()
+            moving = (_PLACES_OF_FORMAT_0, "drop table former_stand") if former else ()
+            for statement in (*renaming, *_SCHEMA, *moving, f"pragma user_version = {FORMAT}"):
+                connection.execute(statement)
+        connection.commit()
 
 
 class LaboratoryPlaces:
@@ -655,17 +750,12 @@ class LaboratoryPlaces:
     """
 
     def __init__(self, account: VesselAccount, laboratory: str) -> None:
-        self._account, self._prefix = account, f"{laboratory}/"
+        self._account, self._laboratory, self._prefix = account, laboratory, f"{laboratory}/"
 
     def stands(self) -> dict[str, str | None]:
         """See `PlaceRecord.stands`."""
         with _writable():
-            places = self._account.places()
-        return {
-            name.removeprefix(self._prefix): entry.place
-            for name, entry in places.items()
-            if name.startswith(self._prefix)
-        }
+            return self._account.stands(self._laboratory)
 
     def put(self, vessel: str, place: str | None, note: str = "") -> None:
         """See `PlaceRecord.put`."""
@@ -730,7 +820,7 @@ def _empty(vessel: str) -> VesselContent:
 
 
 def _after(
-    before: VesselContent, change: tuple[float, float] | None, sign: float
+    before: VesselContent | Component, change: tuple[float, float] | None, sign: float
 ) -> tuple[EntryKind, float | None, float]:
     """Kind, mass and deviation of an entry after a pour; a content that was unknown remains so."""
     if change is None:
@@ -738,6 +828,83 @@ def _after(
     if before.mass is None:
         return "poured", None, 0.0
     return "poured", max(before.mass + sign * change[0], 0.0), math.hypot(before.deviation, change[1])
+
+
+def _take_over(connection: sqlite3.Connection, vessel: str, former: str, *, moved: bool) -> None:
+    """A vessel holds what the one without an id held, which is empty from now on.
+
+    Args:
+        vessel: its id.
+        former: address of the one without an id.
+        moved: whether a motion with it was interrupted: it may have spilled.
+    """
+    held, parts = _last(connection, former), _composition(connection, former)
+    if held is None or (held.mass == 0.0 and not any(part.liquid and part.mass != 0.0 for part in parts)):
+        return
+    own = _last(connection, vessel) or _empty(vessel)
+    certain = False
+    if held.mass is not None and own.mass is not None and not moved:
+        spread = math.hypot(held.deviation, own.deviation)
+        certain = held.liquid == own.liquid and abs(held.mass - own.mass) <= SAME + ENOUGH * spread
+    both = [part for part in (*_composition(connection, vessel), *parts) if part.liquid]
+    if not certain:
+        entered = [Component(entry.liquid, entry.mass, entry.deviation) for entry in (own, held) if entry.liquid]
+        both = [part for part in entered if part.liquid not in {one.liquid for one in both}] + both
+    empty = [part if certain else replace(part, mass=None) for part in parts if not part.liquid]
+    for part in (*empty, *both):
+        _add_component(connection, part, vessel)
+    liquids = {part.liquid for part in _composition(connection, vessel) if part.liquid and part.mass != 0.0}
+    entry = replace(
+        held,
+        vessel=vessel,
+        time=time.time(),
+        kind="weighed" if certain else "unknown",
+        mass=held.mass if certain else None,
+        deviation=held.deviation if certain else 0.0,
+        liquid=MIXTURE if len(liquids) > 1 else next(iter(liquids), held.liquid or own.liquid),
+        pour="",
+        by=held.by or own.by,
+        note=f"is the vessel at {former}",
+    )
+    _write(connection, f"{vessel} is {former} {entry.time}", entry)
+    gone = replace(_empty(former), time=entry.time, kind="filled", note=f"its id is {vessel}", weighed=entry.time)
+    _write(connection, f"{former} is {vessel} {entry.time}", gone)
+    _add_component(connection, Component("", None, 0.0), former)
+
+
+def _identity(connection: sqlite3.Connection, name: str) -> str:
+    return str(connection.execute(f"select {_IDENTITY}", (name,)).fetchone()[0])
+
+
+def _version(connection: sqlite3.Connection) -> int:
+    return int(connection.execute("pragma user_version").fetchone()[0])
+
+
+def _put(
+    connection: sqlite3.Connection, vessel: str, address: tuple[str, str], place: str | None, by: str, note: str
+) -> None:
+    connection.execute(
+        "insert into stand (vessel, t, laboratory, home, place, by, note) values (?, ?, ?, ?, ?, ?, ?)",
+        (vessel, time.time(), *address, place, by, note),
+    )
+
+
+def _composition(connection: sqlite3.Connection, vessel: str) -> list[Component]:
+    of_vessel = f"vessel = {_IDENTITY}"
+    empty = f"select coalesce(max(id), 0) from component where {of_vessel} and liquid = ''"
+    rows = connection.execute(
+        f"select liquid, mass, deviation, source, t from component where {of_vessel} and id >= ({empty}) order by id",
+        (vessel,),
+    ).fetchall()
+    latest = {row[0]: Component(*row) for row in rows}  # a begun dose is followed by its outcome
+    return list(latest.values())
+
+
+def _add_component(connection: sqlite3.Connection, component: Component, vessel: str) -> None:
+    connection.execute(
+        "insert into component (vessel, t, liquid, mass, deviation, source) values (?, ?, ?, ?, ?, ?)",
+        (vessel, time.time(), component.liquid, component.mass, component.deviation, component.source),
+    )
 
 
 _COLUMNS = "vessel, t, kind, mass, deviation, liquid, pour, by, note, weighed, knowledge"
@@ -753,10 +920,12 @@ def _last(connection: sqlite3.Connection, vessel: str) -> VesselContent | None:
     return entries[0] if entries else None
 
 
-def _write(connection: sqlite3.Connection, key: str, row: VesselContent) -> None:
+def _write(connection: sqlite3.Connection, key: str, row: VesselContent) -> bool:
+    """Make an entry, unless there is one with this key. Returns whether it is new."""
     knowledge = None if row.knowledge is None else json.dumps(row.knowledge)
     values = (row.vessel, row.time, row.kind, row.mass, row.deviation, row.liquid, row.pour, row.by, row.note)
-    connection.execute(
+    made = connection.execute(
         f"insert or ignore into entry (key, {_COLUMNS}) values ({', '.join('?' * 12)})",
         (key, *values, row.weighed, knowledge),
     )
+    return made.rowcount > 0

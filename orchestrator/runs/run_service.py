@@ -267,7 +267,7 @@ class RunHandle:
         self._subscribers: list[Subscriber] = [*resources.subscribers, self._note]
         if recorder is not None:
             self._subscribers.append(recorder)
-        if (series := request.campaign.dispense) is not None and series.laboratory:
+        if (series := request.campaign.dispense) is not None and series.accounted:
             carried = bool(request.campaign.laboratory.places)
             self._subscribers.append(VesselAccount.open().follow(series, carried=carried))
         self.begun = self._pausing = self._aborting = self._abandoning = False

@@ -15,7 +15,8 @@ truly stood where and what it held:
 
 With `--mixtures` the campaign is that of `tests.reliability.mixture_night`. Vessels keep what they truly hold from one
 life to the next, except the cup and the source of a dose that was killed while liquid flowed; their cup has to be
-UNKNOWN, and the source right within three of its stated deviations, here and everywhere.
+UNKNOWN, and the source right within three of its stated deviations, here and everywhere. Every other vessel has an id
+at the station.
 """
 
 from __future__ import annotations
@@ -175,10 +176,11 @@ class KilledNight:
     def _weigh_unknown(self) -> None:
         """A person weighs the cups whose content is UNKNOWN, and enters what they hold."""
         account, true = VesselAccount(self.state / FILE_NAME), self._true()
-        for content in account.all():
-            if content.mass is None:
-                mass = true.get(content.vessel.partition("/")[2], 0.0)
-                account.weigh(content.vessel, mass, 1e-4, liquid="mixture" if mass else "", by="somebody")
+        for name in account.stands(self.plan.laboratory.name):
+            vessel = f"{self.plan.laboratory.name}/{name}"
+            if (content := account.content(vessel)) is not None and content.mass is None:
+                mass = true.get(name, 0.0)
+                account.weigh(vessel, mass, 1e-4, liquid="mixture" if mass else "", by="somebody")
 
     # ---- the daemon's process
 
@@ -271,7 +273,7 @@ class KilledNight:
         places: dict[str, str] = {}
         contents: dict[str, str] = {}
         for vessel, at in stands.items():
-            place, held = account.places()[prefix + vessel].place, account.content(prefix + vessel)
+            place, held = account.stands(self.plan.laboratory.name)[vessel], account.content(prefix + vessel)
             places[vessel] = "UNKNOWN" if place is None else "right" if place == at else "wrong"
             mass, mixed = None if held is None else held.mass, flowing and vessel.startswith("rack/")
             mixed = mixed and vessel == next(value[2] for what, value in reversed(life) if what == "flows")
@@ -297,6 +299,9 @@ def _write_mixtures(folder: Path) -> Path:
     laboratory["operator"] = {"answers": "person"}
     yaml.dump(laboratory, folder / "rack.yaml")
     yaml.dump(campaign | {"on_unknown": "ask"}, path)
+    account, plan = VesselAccount.open(folder / "state"), load_campaign(path)
+    for vessel in plan.laboratory.vessels[::2]:
+        account.assign(vessel.name.replace("/", "-"), (plan.laboratory.name, vessel.name), by="somebody")
     return path
 
 

@@ -1,14 +1,14 @@
 """Materials of a station: liquids, vessels and positions, and what their contents can serve.
 
-`Materials` registers them in the daemon's `Store`; the contents are in the account of this machine's vessels
-(`orchestrator.materials.vessel_account`). `Materials.refusal` is the reason why vessels can't serve a pour; it is
-checked before anything moves. A vessel `LABORATORY/VESSEL`, the source of a campaign, needs no registration.
+`Materials` registers them in the daemon's `Store`; the contents and the places of vessels are in the account of this
+machine (`orchestrator.materials.vessel_account`). A position is a place of a rig's laboratory. `Materials.refusal` is
+the reason why vessels can't serve a pour; it is checked before anything moves. A vessel `LABORATORY/VESSEL`, the source
+of a campaign, needs no registration.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from orchestrator.campaigns.file_loading import liquid_from, vessel_from
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.campaigns.yaml.yaml_source import Document
 from orchestrator.daemon.rigs.pour_request import ResponseModel
-from orchestrator.daemon.state.daemon_store import ENDED, Store
+from orchestrator.daemon.state.daemon_store import ENDED, Store, StoreError
 from orchestrator.learning.dispense import ENOUGH
 from orchestrator.learning.run_errors import RunError
 from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, ContentOut, VesselAccount, VesselContent
@@ -31,10 +31,6 @@ from sim_engine.vessel.vessel import build_vessel
 
 SURE = ENOUGH
 """Number of standard deviations by which a content may be smaller than its estimate, and larger."""
-
-
-SAME = 0.5e-3
-"""Largest difference between two accounts of one vessel, beyond their uncertainty [kg]."""
 
 
 class MaterialError(RunError):
@@ -52,7 +48,7 @@ class RegisteredVessel:
         code: bar code; '' without one. Callers may use it instead of the id.
         shape: as in a vessel file.
         capacity: up to the brim [m³].
-        position: id of the position where it stands; '' if it stands nowhere.
+        position: id of the position where it belongs; '' if it belongs nowhere.
     """
 
     id: str
@@ -122,13 +118,37 @@ class Materials:
 
     Args:
         store: its store.
+        laboratories: names of the laboratories, by their rigs; a rig without one has its own name.
 
     Attributes:
-        account: the contents of vessels.
+        account: the contents and places of vessels.
     """
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, laboratories: Mapping[str, str] | None = None) -> None:
         self._store, self.account = store, VesselAccount(store.path.parent / FILE_NAME)
+        self._laboratories = laboratories or {}
+
+    def move_positions(self) -> None:
+        """Enter in the account where vessels stand that former versions had in the store; each once.
+
+        Raises:
+            StoreError: the account can't be read or written.
+        """
+        try:
+            places = self.account.places()
+            for row in self._store.rows("select id, former_position from vessel where former_position is not null"):
+                if row["id"] not in places:
+                    self.account.assign(row["id"], self._address(row["former_position"]))
+                self._store.write("update vessel set former_position = null where id = ?", row["id"])
+        except (OSError, InvalidArgumentError) as error:
+            raise StoreError(str(error)) from error
+
+    def _address(self, position: str) -> tuple[str, str]:
+        """Laboratory and place of a position; both '' if it is ''. Raises MaterialError if it is unknown."""
+        if not position:
+            return "", ""
+        row = self._row("position", position)
+        return self._laboratories.get(row["rig"], row["rig"]), str(row["id"])
 
     # ---- registration
 
@@ -169,9 +189,15 @@ class Materials:
             raise MaterialError("; ".join(f"{p.where or 'shape'}: {p.message}" for p in error.problems)) from None
         except (VesselError, ValueError) as error:
             raise MaterialError(f"shape: {error}") from None
-        self._require_free(position, key)
-        self._add("vessel", key, code, shape=text, capacity=float(capacity), position=position or None)
+        address, place = self._address(position), self.account.places().get(key)
+        if place is not None and place.home != address[1]:
+            raise MaterialError(f"vessel '{key}' is registered already, at another position")
+        if position and (other := self.account.identity("/".join(address))) not in (key, "/".join(address)):
+            raise MaterialError(f"position {address[1]} is taken by vessel {other}; move that one first")
+        self._add("vessel", key, code, shape=text, capacity=float(capacity))
         self.account.weigh(key, 0.0, 0.0, by=by, note="registered as empty", key=f"registered {key}")
+        if place is None and position:
+            self._assign(key, address, by)
 
     def _add(self, table: str, key: str, code: str, **values: Any) -> None:
         """Insert a row; an identical row may be registered again."""
@@ -186,29 +212,28 @@ class Materials:
         names, marks = ", ".join(values), ", ".join("?" * len(values))
         self._store.write(f"insert into {table} ({names}) values ({marks})", *values.values())
 
-    def _require_free(self, position: str, vessel: str) -> None:
-        if not position:
-            return
-        self._row("position", position)
-        standing = self._store.rows("select id from vessel where position = ? and id != ?", position, vessel)
-        if standing:
-            raise MaterialError(f"position {position} is taken by vessel {standing[0]['id']}; move that one first")
-
     def place(self, vessel: str, position: str, by: str) -> None:
-        """Record that a vessel was moved to a position; '' for none. Raises MaterialError.
+        """Record that a vessel was moved to a position, where it belongs from now on; '' for none.
 
-        A vessel `LABORATORY/VESSEL` is moved to a place of its laboratory.
+        A vessel `LABORATORY/VESSEL` is moved to a place of its laboratory, and belongs where it did.
+
+        Raises:
+            MaterialError: vessel or position is unknown, or another vessel belongs there.
+            OSError: the account can't be written.
         """
-        if "/" in vessel:
-            try:
-                self.account.put(vessel, position or None, by=by, note="corrected")
-            except InvalidArgumentError as error:
-                raise MaterialError(str(error)) from None
+        if "/" not in vessel:
+            self._assign(self.vessel(vessel).id, self._address(position), by)
             return
-        registered = self.vessel(vessel)
-        position = str(self._row("position", position)["id"]) if position else ""
-        self._require_free(position, registered.id)
-        self._store.write("update vessel set position = ? where id = ?", position or None, registered.id)
+        try:
+            self.account.put(vessel, position or None, by=by, note="corrected")
+        except InvalidArgumentError as error:
+            raise MaterialError(str(error)) from None
+
+    def _assign(self, vessel: str, address: tuple[str, str], by: str) -> None:
+        try:
+            self.account.assign(vessel, address, by=by)
+        except InvalidArgumentError as error:
+            raise MaterialError(str(error)) from None
 
     # ---- contents
 
@@ -227,6 +252,7 @@ class Materials:
             MaterialError: vessel or liquid is unknown, the liquid is missing, or the vessel can't hold that much.
             OSError: the account can't be written.
         """
+        vessel = self.account.identity(vessel)
         if "/" not in vessel:
             registered = self.vessel(vessel)
             vessel, liquid = registered.id, self.liquid_id(liquid) if liquid else self.content(registered.id).liquid
@@ -257,7 +283,9 @@ class Materials:
             MaterialError: a vessel is unknown, both are the same one, or the source holds less.
             OSError: the account can't be written.
         """
-        source, receiver = (name if "/" in name else self.vessel(name).id for name in (source, receiver))
+        source, receiver = (
+            name if "/" in name else self.vessel(name).id for name in map(self.account.identity, (source, receiver))
+        )
         if source == receiver:
             raise MaterialError(f"{source}: is source and receiver at once")
         try:
@@ -275,26 +303,29 @@ class Materials:
 
         A campaign's source with one of these names is that vessel.
         """
-        rows = self._store.rows(
-            "select vessel.id, coalesce(vessel.code, '') as code, coalesce(position, '') as position from vessel "
-            "left join position on position.id = vessel.position where coalesce(position.rig, ?) = ?",
-            *(rig, rig),
-        )
-        return {name: row["id"] for row in rows for name in (row["position"], row["code"], row["id"]) if name}
+        places, rigs = self.account.places(), self._rigs()
+        names: dict[str, str] = {}
+        for row in self._store.rows("select id, coalesce(code, '') as code from vessel"):
+            home = places[row["id"]].home if row["id"] in places else ""
+            if rigs.get(home, rig) == rig:
+                names |= {name: row["id"] for name in (home, row["code"], row["id"]) if name}
+        return names
+
+    def _rigs(self) -> dict[str, str]:
+        return {row["id"]: row["rig"] for row in self._store.rows("select id, rig from position")}
 
     # ---- look-up
 
     def vessel(self, key: str) -> RegisteredVessel:
-        """Return a vessel by its id or code, or by the position where it stands. Raises MaterialError."""
-        standing = self._store.rows(
-            "select vessel.* from vessel join position on position.id = vessel.position where ? in (position.id, "
-            "position.code) and not exists (select 1 from vessel where ? in (id, code))",
-            *(key, key),
-        )
-        row = standing[0] if standing else self._row("vessel", key)
-        return RegisteredVessel(
-            row["id"], row["code"] or "", json.loads(row["shape"]), row["capacity"], row["position"] or ""
-        )
+        """Return a vessel by its id or code, or by the position where it belongs. Raises MaterialError."""
+        places = self.account.places()
+        if not self._store.rows("select 1 from vessel where ? in (id, code)", key):
+            for position in self._store.rows("select id from position where ? in (id, code)", key):
+                standing = [name for name, place in places.items() if place.home == position["id"]]
+                key = next((name for name in standing if "/" not in name), key)
+        row = self._row("vessel", key)
+        home = places[row["id"]].home if row["id"] in places else ""
+        return RegisteredVessel(row["id"], row["code"] or "", json.loads(row["shape"]), row["capacity"], home)
 
     def liquid(self, key: str, mass: float = 0.1) -> Liquid:
         """Return a liquid by its id or code, as a load with this mass [kg]. Raises MaterialError."""
@@ -311,8 +342,7 @@ class Materials:
 
     def rig_of(self, vessel: str) -> str:
         """Return the rig on which a vessel stands; '' if it stands nowhere. Raises MaterialError."""
-        position = self.vessel(vessel).position
-        return str(self._row("position", position)["rig"]) if position else ""
+        return self._rigs().get(self.vessel(vessel).position, "")
 
     def _row(self, table: str, key: str) -> dict[str, Any]:
         rows = self._store.rows(f"select * from {table} where id = ? or code = ?", key, key)
@@ -328,14 +358,15 @@ class Materials:
             running: names of the laboratories in which a campaign runs.
         """
         contents = {content.vessel: content for content in self.account.all()}
+        places = self.account.places()
         vessels = []
         for row in self._store.rows(
-            "select id, coalesce(code, '') as code, coalesce(position, '') as position, 1e6 * capacity as capacity_ml "
-            "from vessel order by id"
+            "select id, coalesce(code, '') as code, 1e6 * capacity as capacity_ml from vessel order by id"
         ):
             held = contents.pop(row["id"], None) or VesselContent(row["id"], 0.0, "weighed", 0.0, 0.0)
-            vessels.append(VesselOut(**row, content=held.content, promised_g=1e3 * self.promised(row["id"])))
-        places = self.account.places()
+            place, promised = places.get(row["id"]), 1e3 * self.promised(row["id"])
+            position = "" if place is None else place.text if place.place is None else place.home
+            vessels.append(VesselOut(**row, position=position, content=held.content, promised_g=promised))
         sources = []
         for name, held in contents.items():
             place, in_use = places.get(name), name.partition("/")[0] in running
@@ -396,7 +427,8 @@ class Materials:
         held, target = self.content(source.id), self.content(receiver.id)
         for vessel, content in ((source, held), (receiver, target)):
             if content.mass is None:
-                return f"{vessel.id}: pour {content.pour} left it with an unknown content; weigh the vessel"
+                cause = f"pour {content.pour} left it with an unknown content" if content.pour else "holds UNKNOWN"
+                return f"{vessel.id}: {cause}; weigh the vessel"
         assert held.mass is not None
         assert target.mass is not None
         if not held.liquid or held.mass <= 0.0:
@@ -420,34 +452,6 @@ class Materials:
             return (
                 f"{receiver.id}: holds {1e6 * receiver.capacity:.0f} ml up to the brim, and there could be "
                 f"{1e6 * most / density:.0f} ml in it afterwards"
-            )
-        return ""
-
-    def refusal_at(self, place: str, receiver: str, liquid: str) -> str:
-        """Return the reason why the cup at a place of a laboratory gets no more of a liquid; '' if it does.
-
-        Args:
-            place: 'LABORATORY/PLACE', under which the arm accounts for the cup that stands there.
-            receiver: id of that cup.
-            liquid: id of the liquid.
-        """
-        carried, held = self.account.content(place), self.content(receiver)
-        remedy = f"weigh it: decant materials weigh {place} MASS, or '0 g' if an empty one stands there"
-        if carried is None:
-            return ""
-        if carried.mass is None or held.mass is None:
-            return f"{receiver}: the content of the cup at {place} is UNKNOWN; {remedy}"
-        mass = next((c.mass for c in self.account.composition(place) if c.liquid == liquid and c.mass != 0.0), 0.0)
-        if mass != 0.0:
-            amount = "an UNKNOWN mass" if mass is None else f"{1e3 * mass:.1f} g"
-            return (
-                f"{receiver}: the cup at {place} has {amount} of {liquid} already, and no liquid is dosed into a cup "
-                f"twice; {remedy}"
-            )
-        if abs(carried.mass - held.mass) > SAME + SURE * math.hypot(carried.deviation, held.deviation):
-            return (
-                f"{receiver}: holds {1e3 * held.mass:.1f} g by the account of the station, and "
-                f"{1e3 * carried.mass:.1f} g by that of {place}; {remedy}"
             )
         return ""
 

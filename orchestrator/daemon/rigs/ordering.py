@@ -103,7 +103,7 @@ class Ordering:
 
     def __init__(self, daemon: SharedServices, queue: CampaignQueue) -> None:
         self._daemon, self._queue = daemon, queue
-        self.materials, self.book = Materials(daemon.store), OrderBook(daemon.store)
+        self.materials, self.book = Materials(daemon.store, daemon.settings.laboratories), OrderBook(daemon.store)
         self._placing: dict[str, asyncio.Task[Any]] = {}
 
     async def pour(self, request: PourIn, by: str) -> PourOut:

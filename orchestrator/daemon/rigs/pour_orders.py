@@ -45,7 +45,7 @@ from orchestrator.learning.requests import Failed, Simulated, Slots
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.single_action import OnePour, RepeatedSimulation
 from orchestrator.learning.stage_result import DOSE, weighed_masses
-from orchestrator.materials.vessel_account import MIXTURE, Transfer
+from orchestrator.materials.vessel_account import MIXTURE, LaboratoryPlaces, Transfer
 from orchestrator.records.run_record import RunPour, read_record
 from orchestrator.runs.run_service import RunRequest
 from orchestrator.runs.run_tasks import single_task
@@ -251,8 +251,8 @@ def renewed(order: PourOrder, materials: Materials) -> PourOrder:
     return order.model_copy(update=update)
 
 
-def carried_cup(order: PourOrder, laboratory: LaboratorySettings | None) -> str:
-    """'LABORATORY/PLACE' of the cup that an arm carries for an order; '' if it carries none.
+def is_carried(order: PourOrder, laboratory: LaboratorySettings | None) -> bool:
+    """Whether an arm carries the vessels of an order.
 
     Args:
         order: the order.
@@ -262,7 +262,7 @@ def carried_cup(order: PourOrder, laboratory: LaboratorySettings | None) -> str:
         OrderError: a vessel stands at no place for it.
     """
     if laboratory is None or not laboratory.places or order.amount is None or not (order.stand or order.position):
-        return ""
+        return False
     places = [place.name for place in all_places(laboratory.places)]
     for vessel, position in ((order.source, order.stand), (order.receiver, order.position)):
         if position not in places or (vessel == order.receiver and "/" not in position):
@@ -271,7 +271,7 @@ def carried_cup(order: PourOrder, laboratory: LaboratorySettings | None) -> str:
                 f"{vessel}: stands {stands}, and the arm of laboratory '{laboratory.name}' pours from a source with a "
                 f"place into a cup in a rack; its places are {', '.join(places)}"
             )
-    return f"{laboratory.name}/{order.position}"
+    return True
 
 
 def refusal(order: PourOrder, materials: Materials, laboratory: LaboratorySettings | None) -> str:
@@ -286,9 +286,20 @@ def refusal(order: PourOrder, materials: Materials, laboratory: LaboratorySettin
         OrderError: a vessel stands at no place for it.
     """
     reason = materials.refusal(order.source, order.receiver, order.liquid, order.amount, order.tolerance, pour=order.id)
-    if not reason and (cup := carried_cup(order, laboratory)):
-        reason = materials.refusal_at(cup, order.receiver, order.liquid)
-    return reason
+    if reason or laboratory is None or not is_carried(order, laboratory):
+        return reason
+    for vessel, position in ((order.source, order.stand), (order.receiver, order.position)):
+        if materials.account.identity(f"{laboratory.name}/{position}") != vessel:  # the rig had another laboratory
+            return f"{vessel}: does not stand at '{position}' of laboratory '{laboratory.name}'; place it there again"
+    places = LaboratoryPlaces(materials.account, laboratory.name)
+    mass, _ = places.composition(order.position).get(order.liquid, (0.0, 0.0))
+    if mass == 0.0:
+        return ""
+    amount = "an UNKNOWN mass" if mass is None else f"{1e3 * mass:.1f} g"
+    return (
+        f"{order.receiver}: has {amount} of {order.liquid} already, and no liquid is dosed into a cup twice. If it "
+        f"was emptied, enter that: decant materials weigh {order.receiver} '0 g'"
+    )
 
 
 @dataclass(frozen=True)
@@ -312,6 +323,7 @@ class PlannedOrder:
             OrderError: there is no place for the pourer.
             ConfigError: the laboratory's file is invalid.
         """
+        carried = is_carried(order, rig.spec)
         pourer, receiver = (vessel_from(Document.of(vessel, folder / ORDER)) for vessel in (order.pourer, order.vessel))
         liquid = liquid_of(order.liquid, order.properties, round(order.load, 9))
         action = _action(order.action, _USUAL) if "x_offset" in order.action else _placed(
@@ -328,13 +340,14 @@ class PlannedOrder:
             "pourer": order.pourer,
             "receiver": order.vessel,
             "motion": motion,
-            **_poured_sections(order, liquid, carried=bool(carried_cup(order, rig.spec))),
+            **_poured_sections(order, liquid, carried=carried),
             "outputs": {"recording": False, "figures": False},
         }
         plan = campaign_from(Document.of(record, folder / ORDER))
         if plan.dispense is not None:
-            # `OrderBook.settle` enters the outcome in the account of both vessels, once
-            plan = replace(plan, dispense=replace(plan.dispense, laboratory=""))
+            # the run accounts for vessels that it carries; of others `OrderBook.settle` enters the outcome, once
+            vessels = {order.stand: order.source, order.position: order.receiver} if carried else {}
+            plan = replace(plan, dispense=replace(plan.dispense, laboratory="", vessels=vessels))
         (scene,) = scenes_of(plan).values()
         return cls(plan, order, scene)
 
@@ -518,11 +531,14 @@ def _weighed(order: PourOrder, pour: RunPour, measured: PourMeasurement, deviati
 
 @dataclass(frozen=True)
 class SettledOrder:
-    """A pour as its journal records it, with the deviation of one weighing [kg]."""
+    """A pour as its journal records it, with the deviation of one weighing [kg], and whether an arm carried its
+    vessels: then its run has accounted for them.
+    """
 
     order: PourOrder
     pour: RunPour
     deviation: float
+    carried: bool
 
 
 def settled_pour(run: Path, snapshot: Path, rig: Rig) -> SettledOrder | None:
@@ -542,9 +558,8 @@ def settled_pour(run: Path, snapshot: Path, rig: Rig) -> SettledOrder | None:
     pours = read_record(run).pours
     if not pours:
         return None
-    return SettledOrder(
-        PourOrder.read(snapshot), pours[0], weighing_deviation(rig.spec or load_laboratory(shipped(VIRTUAL)))
-    )
+    order, laboratory = PourOrder.read(snapshot), rig.spec or load_laboratory(shipped(VIRTUAL))
+    return SettledOrder(order, pours[0], weighing_deviation(laboratory), is_carried(order, rig.spec))
 
 
 class PlacedOrder(BaseModel):
@@ -603,7 +618,7 @@ class OrderBook:
         )
 
     def settle(self, item: QueueItem, settled: SettledOrder | None, *, ended: bool) -> None:
-        """Enter the outcome of a pour in the account and store its result. A second call changes nothing.
+        """Store the result of a pour, and enter it in the account unless its run has. A second call changes nothing.
 
         Args:
             item: campaign of the order.
@@ -628,6 +643,6 @@ class OrderBook:
             moved = Transfer(None, None)
         else:
             return
-        if moved is not None:
+        if moved is not None and not settled.carried:
             self._materials.account.transfer(placed.id, placed.source, placed.receiver, moved, by=item.by)
         self._store.write("update pour_order set result = ? where campaign = ?", result.model_dump_json(), item.id)

@@ -16,6 +16,7 @@ import shutil
 from actors.interfaces import LaboratoryError
 from orchestrator.daemon.rigs.campaign_queue import CampaignQueue
 from orchestrator.daemon.rigs.emergency_stop import EmergencyStops
+from orchestrator.daemon.rigs.materials import Materials
 from orchestrator.daemon.rigs.pour_orders import OrderBook
 from orchestrator.daemon.rigs.rig_worker import SharedServices
 from orchestrator.daemon.state.daemon_settings import DaemonSettings
@@ -54,8 +55,13 @@ class Supervisor:
         self._tasks: list[asyncio.Task[None]] = []
 
     async def start(self) -> None:
-        """Recover the stored state and start all tasks."""
+        """Recover the stored state and start all tasks.
+
+        Raises:
+            StoreError: the account of vessels can't be used.
+        """
         shared = self.shared
+        Materials(shared.store, shared.settings.laboratories).move_positions()
         acknowledged = {row["id"] for row in shared.store.rows("select id from campaign")}
         await asyncio.to_thread(self._remove_unacknowledged, acknowledged)
         for item in shared.store.active():

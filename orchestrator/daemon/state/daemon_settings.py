@@ -223,6 +223,11 @@ class DaemonSettings:
         """Path of the file with the running daemon's URL."""
         return self.state / "url"
 
+    @property
+    def laboratories(self) -> dict[str, str]:
+        """Names of the laboratories, by their rigs."""
+        return {rig.name: rig.spec.name for rig in self.rigs if rig.spec is not None}
+
     def rig(self, name: str) -> Rig:
         """Return a rig by its name. Raises KeyError."""
         return next(rig for rig in (*self.rigs, Rig(NO_RIG)) if rig.name == name)

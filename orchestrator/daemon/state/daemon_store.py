@@ -24,11 +24,12 @@ from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal_file import locked_alone
 from orchestrator.records.run_registry import make_state_directory
 
-FORMAT = 6
+FORMAT = 7
 
 _UPGRADES = {
     5: "alter table campaign add column verdict text check (verdict is null or json_valid(verdict));"
-    "alter table campaign add column after text;"
+    "alter table campaign add column after text;",
+    6: "alter table vessel rename column position to former_position;",
 }
 """Format → statements that convert it to the next one."""
 
@@ -79,14 +80,15 @@ create table position (
 ) strict;
 create table vessel (
     id text primary key, code text unique, shape text not null check (json_valid(shape)), capacity real not null,
-    position text unique, liquid text, created real not null
+    former_position text unique, liquid text, created real not null
 ) strict;
 create table node_action (
     id text primary key, name text not null, args text not null check (json_valid(args)), created real not null,
     started real, error text, json_result text
 ) strict;
 """
-"""Ordered pours and materials. Masses in kg, capacities in m³."""
+"""Ordered pours and materials. Masses in kg, capacities in m³. Where vessels stand is in their account; a
+`former_position` is what formats up to 6 had of it, until the daemon has entered it there."""
 
 
 class StoreError(RunError):

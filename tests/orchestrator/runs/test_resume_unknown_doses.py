@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -192,10 +193,13 @@ def test_a_share_has_no_interval_if_one_of_its_doses_has_none() -> None:
     assert {c.share_half_interval for c in result.model_copy(update={"doses": doses}).components()} == {None}
 
 
-@pytest.mark.parametrize("carried", [False, True])
-def test_after_the_answer_the_account_knows_the_cup(carried: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("carried", "ordered"), [(False, False), (True, False), (True, True)])
+def test_after_the_answer_the_account_knows_the_cup(carried: bool, ordered: bool, tmp_path: Path) -> None:
     account, (_, events) = VesselAccount(tmp_path / "vessels.sqlite"), dosed(10.2, "received 38 ± 2 g")
-    follow = account.follow(SERIES, carried=carried)
+    ids = {"rack/A1": "cup-1", "source/water": "can", "source/oil": "jug"} if ordered else {}
+    for place, vessel in ids.items():
+        account.assign(vessel, ("bench", place), by="ada")
+    follow = account.follow(replace(SERIES, laboratory="", vessels=ids) if ordered else SERIES, carried=carried)
     if carried:  # the bench enters its own doses, and that the second one has begun
         for liquid, mass in (("oil", 10.2e-3), ("water", None)):
             account.add_component("bench/rack/A1", liquid, mass, 2e-4, f"bench/source/{liquid}")

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from actors.interfaces import ProgressCallback
 from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
 from orchestrator.daemon.state.daemon_settings import Rig
-from orchestrator.materials.vessel_account import FILE_NAME, VesselAccount
+from orchestrator.materials.vessel_account import FILE_NAME, LaboratoryPlaces, VesselAccount
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.run_folder import RESOLVED
+from sim_engine.outcome import PourMeasurement
+from sim_engine.scene import Scene
 from tests.support.station import content, order, rigs_in, set_up, until_pour
-from tests.support.toy_daemon import Served, held, serving
+from tests.support.toy_campaign import ToyOptimizer, ToySimulators
+from tests.support.toy_daemon import HeldBench, HeldLaboratory, Served, held, serving
 
 
 def begun(folder: Path) -> int:
@@ -209,9 +214,35 @@ async def rack_set_up(served: Served) -> None:
         await served.post(path, body)
 
 
-async def test_an_order_names_the_positions_of_a_rack_whose_cup_the_arm_carries(tmp_path: Path) -> None:
+class CarryingBench(HeldBench):
+    """Enters a dose of 30.1 g in the account as `DoseHandling` does."""
+
+    async def pour(
+        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None, dose: Any = None
+    ) -> PourMeasurement:
+        places, liquid, source = LaboratoryPlaces(VesselAccount.open(), "rack"), scene.liquid.name, dose.source
+        places.add_component(dose.cup, liquid, None, 0.0, source.vessel)
+        places.content(dose.cup, None, 0.0, liquid)
+        await super().pour(scene, action, seed=seed, progress=progress, dose=dose)
+        places.add_component(dose.cup, liquid, 0.0301, 1e-4, source.vessel)
+        places.content(dose.cup, 0.0301, 1e-4, liquid)
+        left = source.mass - 0.0301
+        places.content(source.vessel, left, 4e-4, liquid)
+        return PourMeasurement(source.mass, 0.0, left, {"dose": {"received": 0.0301, "left": [left, 4e-4]}})
+
+
+async def test_an_order_names_the_positions_of_a_rack_whose_cup_the_arm_carries(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DECANT_STATE", str(tmp_path / "state"))
     rigs = (Rig("left", RACK, load_laboratory(RACK)),)
-    async with serving(tmp_path, held, rigs=rigs) as served:
+
+    def make() -> HeldLaboratory:
+        laboratory = HeldLaboratory(ToySimulators(), CarryingBench(), ToyOptimizer())
+        laboratory.bench.go.clear()
+        return laboratory
+
+    async with serving(tmp_path, make, rigs=rigs) as served:
         await rack_set_up(served)
         wanted = order(source="source/water", receiver="rack/A1", amount="30 g")
         tried = await served.post("/pours", wanted | {"predict": True, "dry_run": True})
@@ -224,10 +255,16 @@ async def test_an_order_names_the_positions_of_a_rack_whose_cup_the_arm_carries(
         ]  # fmt: skip
         dose = laboratory.bench.dose
         assert (dose.cup, dose.source.vessel, dose.source.mass) == ("rack/A1", "source/water", 0.3)
+        assert (await content(served, "cup-1"))["mass_g"] is None
         laboratory.bench.go.set()
         done = await until_pour(served, "order-1", "weighed")
         assert placed["campaign"] == done["campaign"]
-        assert (await content(served, "cup-1"))["mass_g"] == pytest.approx(done["result"]["received_g"])
+        for vessel, grams in (("cup-1", done["result"]["received_g"]), ("can", 300.0 - 30.1)):  # each counts once
+            assert (await content(served, vessel))["mass_g"] == pytest.approx(grams), vessel
+        terminal = LaboratoryPlaces(VesselAccount.open(), "rack")
+        assert terminal.composition("rack/A1")["water"][0] == 0.0301
+        again = await served.post("/pours", order("order-2", **{**wanted, "id": "order-2"}), status=409)
+        assert "cup-1: has 30.1 g of water already, and no liquid is dosed into a cup twice" in again["detail"]
 
 
 async def test_a_cup_in_a_rack_that_is_unknown_or_has_the_liquid_is_refused(tmp_path: Path) -> None:
@@ -244,15 +281,17 @@ async def test_a_cup_in_a_rack_that_is_unknown_or_has_the_liquid_is_refused(tmp_
         assert "cup-2: stands at 'shelf', and the arm of laboratory 'rack' pours" in await refused(
             422, receiver="cup-2"
         )
-        account.add_component("rack/rack/A1", "water", 0.02, 1e-4)
+        account.add_component("rack/rack/A1", "water", 0.02, 1e-4)  # as a run at the terminal does
         account.weigh("rack/rack/A1", 0.02, 1e-4, liquid="water")
-        assert "cup-1: the cup at rack/rack/A1 has 20.0 g of water already" in await refused()
-        account.add_component("rack/rack/A1", "", None, 0.0)
-        assert "holds 0.0 g by the account of the station, and 20.0 g by that of rack/rack/A1" in await refused()
+        assert "cup-1: has 20.0 g of water already" in await refused()
+        account.add_component("rack/rack/A1", "water", None, 0.0)
+        assert "cup-1: has an UNKNOWN mass of water already" in await refused()
         account.lose("rack/rack/A1")
-        unknown = await refused()
-        assert "the content of the cup at rack/rack/A1 is UNKNOWN; weigh it: decant materials weigh" in unknown
+        assert "cup-1: holds UNKNOWN; weigh the vessel" in await refused()
         account.weigh("rack/rack/A1", 0.0, 0.0, by="a person")
+        account.assign("cup-1", ("another", "rack/A1"), by="ada")  # the rig had another laboratory
+        assert "cup-1: does not stand at 'rack/A1' of laboratory 'rack'; place it there again" in await refused()
+        await served.post("/materials/vessels/cup-1/place", {"position": "rack/A1"})
         await served.post("/queue/pause")
         await served.post("/pours", order(source="can", receiver="rack/A1", amount="30 g"))
         account.lose("rack/rack/A1")  # while it waits

@@ -1,0 +1,121 @@
+BEGIN TRANSACTION;
+CREATE TABLE component (
+    id integer primary key, vessel text not null, t real not null, liquid text not null, mass real,
+    deviation real not null, source text not null
+) strict;
+INSERT INTO "component" VALUES(1,'rack/rack/A1',1700000028.0,'',NULL,0.0,'');
+INSERT INTO "component" VALUES(2,'rack/rack/A1',1700000032.0,'',0.0901,5.0e-05,'');
+INSERT INTO "component" VALUES(3,'rack/rack/A1',1700000034.0,'water',NULL,0.0,'rack/source/water');
+INSERT INTO "component" VALUES(4,'rack/rack/A1',1700000039.0,'water',0.03,0.0001,'rack/source/water');
+INSERT INTO "component" VALUES(5,'rack/rack/A2',1700000059.0,'',NULL,0.0,'');
+INSERT INTO "component" VALUES(6,'rack/rack/A2',1700000063.0,'',0.0901,5.0e-05,'');
+INSERT INTO "component" VALUES(7,'rack/rack/A2',1700000065.0,'water',NULL,0.0,'rack/source/water');
+INSERT INTO "component" VALUES(8,'rack/rack/A2',1700000070.0,'water',0.01,0.0001,'rack/source/water');
+INSERT INTO "component" VALUES(9,'rack/rack/B2',1700000089.0,'',NULL,0.0,'');
+INSERT INTO "component" VALUES(10,'rack/rack/B2',1700000093.0,'',0.0901,5.0e-05,'');
+INSERT INTO "component" VALUES(11,'rack/rack/B2',1700000095.0,'water',NULL,0.0,'rack/source/water');
+INSERT INTO "component" VALUES(12,'rack/rack/B2',1700000100.0,'water',0.025,0.0001,'rack/source/water');
+INSERT INTO "component" VALUES(13,'rack/rack/C1',1700000120.0,'',NULL,0.0,'');
+INSERT INTO "component" VALUES(14,'rack/rack/C1',1700000124.0,'',0.0901,5.0e-05,'');
+INSERT INTO "component" VALUES(15,'rack/rack/C1',1700000126.0,'water',NULL,0.0,'rack/source/water');
+CREATE TABLE entry (
+    id integer primary key, key text unique not null, vessel text not null, t real not null, kind text not null,
+    mass real, deviation real not null, liquid text not null, pour text not null, by text not null,
+    note text not null, weighed real, knowledge text check (knowledge is null or json_valid(knowledge))
+) strict;
+INSERT INTO "entry" VALUES(1,'registered can','can',1700000011.0,'weighed',0.0,0.0,'','','ada','registered as empty',1700000011.0,NULL);
+INSERT INTO "entry" VALUES(2,'registered cup-1','cup-1',1700000013.0,'weighed',0.0,0.0,'','','ada','registered as empty',1700000013.0,NULL);
+INSERT INTO "entry" VALUES(3,'registered cup-2','cup-2',1700000015.0,'weighed',0.0,0.0,'','','ada','registered as empty',1700000015.0,NULL);
+INSERT INTO "entry" VALUES(4,'registered cup-3','cup-3',1700000017.0,'weighed',0.0,0.0,'','','ada','registered as empty',1700000017.0,NULL);
+INSERT INTO "entry" VALUES(5,'registered cup-4','cup-4',1700000019.0,'weighed',0.0,0.0,'','','ada','registered as empty',1700000019.0,NULL);
+INSERT INTO "entry" VALUES(6,'registered cup-5','cup-5',1700000021.0,'weighed',0.0,0.0,'','','ada','registered as empty',1700000021.0,NULL);
+INSERT INTO "entry" VALUES(7,'weighed can 1700000023000000000','can',1700000022.0,'weighed',0.3,0.0001,'water','','ada','',1700000022.0,NULL);
+INSERT INTO "entry" VALUES(8,'weighed rack/rack/A1 1700000027000000000','rack/rack/A1',1700000026.0,'weighed',0.0,0.0,'','','','',1700000026.0,NULL);
+INSERT INTO "entry" VALUES(9,'unknown rack/rack/A1 1700000036000000000','rack/rack/A1',1700000035.0,'unknown',NULL,0.0,'','','','',1700000026.0,NULL);
+INSERT INTO "entry" VALUES(10,'weighed rack/source/water 1700000038000000000','rack/source/water',1700000037.0,'weighed',0.2852,0.015,'water','','','',1700000037.0,NULL);
+INSERT INTO "entry" VALUES(11,'weighed rack/rack/A1 1700000041000000000','rack/rack/A1',1700000040.0,'weighed',0.03,0.0001,'water','','','',1700000040.0,NULL);
+INSERT INTO "entry" VALUES(12,'weighed rack/source/water 1700000043000000000','rack/source/water',1700000042.0,'weighed',0.2702,0.0004,'water','','','',1700000042.0,NULL);
+INSERT INTO "entry" VALUES(13,'weighed rack/rack/A1 1700000047000000000','rack/rack/A1',1700000046.0,'weighed',0.03005,0.0001,'water','','','',1700000046.0,NULL);
+INSERT INTO "entry" VALUES(14,'order-1 from','can',1700000051.0,'poured',0.27,1.8027756377319946587e-04,'water','order-1','bo','',1700000022.0,NULL);
+INSERT INTO "entry" VALUES(15,'order-1 into','cup-1',1700000052.0,'poured',0.03,0.00015,'water','order-1','bo','',1700000013.0,NULL);
+INSERT INTO "entry" VALUES(16,'weighed rack/rack/A2 1700000058000000000','rack/rack/A2',1700000057.0,'weighed',0.0,0.0,'','','','',1700000057.0,NULL);
+INSERT INTO "entry" VALUES(17,'unknown rack/rack/A2 1700000067000000000','rack/rack/A2',1700000066.0,'unknown',NULL,0.0,'','','','',1700000057.0,NULL);
+INSERT INTO "entry" VALUES(18,'weighed rack/source/water 1700000069000000000','rack/source/water',1700000068.0,'weighed',0.2651,0.005,'water','','','',1700000068.0,NULL);
+INSERT INTO "entry" VALUES(19,'weighed rack/rack/A2 1700000072000000000','rack/rack/A2',1700000071.0,'weighed',0.01,0.0001,'water','','','',1700000071.0,NULL);
+INSERT INTO "entry" VALUES(20,'weighed rack/source/water 1700000074000000000','rack/source/water',1700000073.0,'weighed',0.2601,0.0004,'water','','','',1700000073.0,NULL);
+INSERT INTO "entry" VALUES(21,'weighed rack/rack/A2 1700000078000000000','rack/rack/A2',1700000077.0,'weighed',0.01005,0.0001,'water','','','',1700000077.0,NULL);
+INSERT INTO "entry" VALUES(22,'weighed rack/rack/B2 1700000088000000000','rack/rack/B2',1700000087.0,'weighed',0.0,0.0,'','','','',1700000087.0,NULL);
+INSERT INTO "entry" VALUES(23,'unknown rack/rack/B2 1700000097000000000','rack/rack/B2',1700000096.0,'unknown',NULL,0.0,'','','','',1700000087.0,NULL);
+INSERT INTO "entry" VALUES(24,'weighed rack/source/water 1700000099000000000','rack/source/water',1700000098.0,'weighed',0.2475,0.0125,'water','','','',1700000098.0,NULL);
+INSERT INTO "entry" VALUES(25,'weighed rack/rack/B2 1700000102000000000','rack/rack/B2',1700000101.0,'weighed',0.025,0.0001,'water','','','',1700000101.0,NULL);
+INSERT INTO "entry" VALUES(26,'weighed rack/source/water 1700000104000000000','rack/source/water',1700000103.0,'weighed',0.235,0.0004,'water','','','',1700000103.0,NULL);
+INSERT INTO "entry" VALUES(27,'weighed rack/rack/B2 1700000108000000000','rack/rack/B2',1700000107.0,'weighed',2.50500000000000028199e-02,0.0001,'water','','','',1700000107.0,NULL);
+INSERT INTO "entry" VALUES(28,'weighed rack/rack/C1 1700000119000000000','rack/rack/C1',1700000118.0,'weighed',0.0,0.0,'','','','',1700000118.0,NULL);
+INSERT INTO "entry" VALUES(29,'unknown rack/rack/C1 1700000128000000000','rack/rack/C1',1700000127.0,'unknown',NULL,0.0,'','','','',1700000118.0,NULL);
+INSERT INTO "entry" VALUES(30,'weighed rack/source/water 1700000130000000000','rack/source/water',1700000129.0,'weighed',0.225,0.01,'water','','','',1700000129.0,NULL);
+INSERT INTO "entry" VALUES(31,'weighed jar/oil 1700000132000000000','jar/oil',1700000131.0,'weighed',0.1,0.0001,'oil','','ada','',1700000131.0,NULL);
+INSERT INTO "entry" VALUES(32,'by hand m-1 from','jar/oil',1700000133.0,'poured',0.092,1.41421356237309507998e-04,'oil','by hand m-1','ada','',1700000131.0,NULL);
+INSERT INTO "entry" VALUES(33,'by hand m-1 into','cup-5',1700000134.0,'poured',0.008,0.0001,'oil','by hand m-1','ada','',1700000021.0,NULL);
+INSERT INTO "entry" VALUES(34,'weighed cup-4 1700000136000000000','cup-4',1700000135.0,'weighed',0.012,0.0001,'oil','','ada','',1700000135.0,NULL);
+INSERT INTO "entry" VALUES(35,'weighed night/pourer 1700000138000000000','night/pourer',1700000137.0,'weighed',0.1,0.0001,'water','','','',1700000137.0,NULL);
+INSERT INTO "entry" VALUES(36,'weighed night/receiver 1700000141000000000','night/receiver',1700000140.0,'weighed',0.02,0.0001,'water','','','',1700000140.0,NULL);
+CREATE TABLE stand (
+    id integer primary key, vessel text not null, t real not null, place text, by text not null, note text not null
+) strict;
+INSERT INTO "stand" VALUES(1,'rack/source/water',1700000024.0,'source/water','','laid out by the operator');
+INSERT INTO "stand" VALUES(2,'rack/rack/A1',1700000025.0,'rack/A1','','laid out by the operator');
+INSERT INTO "stand" VALUES(3,'rack/rack/A1',1700000029.0,NULL,'','the arm began to take it from ''rack/A1''');
+INSERT INTO "stand" VALUES(4,'rack/rack/A1',1700000030.0,NULL,'','the arm began to carry it to ''pan''');
+INSERT INTO "stand" VALUES(5,'rack/rack/A1',1700000031.0,'pan','','');
+INSERT INTO "stand" VALUES(6,'rack/source/water',1700000033.0,NULL,'','the arm began to take it from ''source/water''');
+INSERT INTO "stand" VALUES(7,'rack/source/water',1700000044.0,NULL,'','the arm began to carry it to ''source/water''');
+INSERT INTO "stand" VALUES(8,'rack/source/water',1700000045.0,'source/water','','');
+INSERT INTO "stand" VALUES(9,'rack/rack/A1',1700000048.0,NULL,'','the arm began to take it from ''pan''');
+INSERT INTO "stand" VALUES(10,'rack/rack/A1',1700000049.0,NULL,'','the arm began to carry it to ''rack/A1''');
+INSERT INTO "stand" VALUES(11,'rack/rack/A1',1700000050.0,'rack/A1','','');
+INSERT INTO "stand" VALUES(12,'rack/source/water',1700000053.0,NULL,'','laid out again');
+INSERT INTO "stand" VALUES(13,'rack/rack/A1',1700000054.0,'','','laid out again');
+INSERT INTO "stand" VALUES(14,'rack/source/water',1700000055.0,'source/water','','laid out by the operator');
+INSERT INTO "stand" VALUES(15,'rack/rack/A2',1700000056.0,'rack/A2','','laid out by the operator');
+INSERT INTO "stand" VALUES(16,'rack/rack/A2',1700000060.0,NULL,'','the arm began to take it from ''rack/A2''');
+INSERT INTO "stand" VALUES(17,'rack/rack/A2',1700000061.0,NULL,'','the arm began to carry it to ''pan''');
+INSERT INTO "stand" VALUES(18,'rack/rack/A2',1700000062.0,'pan','','');
+INSERT INTO "stand" VALUES(19,'rack/source/water',1700000064.0,NULL,'','the arm began to take it from ''source/water''');
+INSERT INTO "stand" VALUES(20,'rack/source/water',1700000075.0,NULL,'','the arm began to carry it to ''source/water''');
+INSERT INTO "stand" VALUES(21,'rack/source/water',1700000076.0,'source/water','','');
+INSERT INTO "stand" VALUES(22,'rack/rack/A2',1700000079.0,NULL,'','the arm began to take it from ''pan''');
+INSERT INTO "stand" VALUES(23,'rack/rack/A2',1700000080.0,NULL,'','the arm began to carry it to ''rack/A2''');
+INSERT INTO "stand" VALUES(24,'rack/rack/A2',1700000081.0,'rack/A2','','');
+INSERT INTO "stand" VALUES(25,'rack/rack/A1',1700000082.0,'','','laid out again');
+INSERT INTO "stand" VALUES(26,'rack/source/water',1700000083.0,NULL,'','laid out again');
+INSERT INTO "stand" VALUES(27,'rack/rack/A2',1700000084.0,'','','laid out again');
+INSERT INTO "stand" VALUES(28,'rack/source/water',1700000085.0,'source/water','','laid out by the operator');
+INSERT INTO "stand" VALUES(29,'rack/rack/B2',1700000086.0,'rack/B2','','laid out by the operator');
+INSERT INTO "stand" VALUES(30,'rack/rack/B2',1700000090.0,NULL,'','the arm began to take it from ''rack/B2''');
+INSERT INTO "stand" VALUES(31,'rack/rack/B2',1700000091.0,NULL,'','the arm began to carry it to ''pan''');
+INSERT INTO "stand" VALUES(32,'rack/rack/B2',1700000092.0,'pan','','');
+INSERT INTO "stand" VALUES(33,'rack/source/water',1700000094.0,NULL,'','the arm began to take it from ''source/water''');
+INSERT INTO "stand" VALUES(34,'rack/source/water',1700000105.0,NULL,'','the arm began to carry it to ''source/water''');
+INSERT INTO "stand" VALUES(35,'rack/source/water',1700000106.0,'source/water','','');
+INSERT INTO "stand" VALUES(36,'rack/rack/B2',1700000109.0,NULL,'','the arm began to take it from ''pan''');
+INSERT INTO "stand" VALUES(37,'rack/rack/B2',1700000110.0,NULL,'','the arm began to carry it to ''rack/B2''');
+INSERT INTO "stand" VALUES(38,'rack/rack/B2',1700000111.0,'rack/B2','','');
+INSERT INTO "stand" VALUES(39,'rack/rack/A1',1700000112.0,'','','laid out again');
+INSERT INTO "stand" VALUES(40,'rack/rack/A2',1700000113.0,'','','laid out again');
+INSERT INTO "stand" VALUES(41,'rack/source/water',1700000114.0,NULL,'','laid out again');
+INSERT INTO "stand" VALUES(42,'rack/rack/B2',1700000115.0,'','','laid out again');
+INSERT INTO "stand" VALUES(43,'rack/source/water',1700000116.0,'source/water','','laid out by the operator');
+INSERT INTO "stand" VALUES(44,'rack/rack/C1',1700000117.0,'rack/C1','','laid out by the operator');
+INSERT INTO "stand" VALUES(45,'rack/rack/C1',1700000121.0,NULL,'','the arm began to take it from ''rack/C1''');
+INSERT INTO "stand" VALUES(46,'rack/rack/C1',1700000122.0,NULL,'','the arm began to carry it to ''pan''');
+INSERT INTO "stand" VALUES(47,'rack/rack/C1',1700000123.0,'pan','','');
+INSERT INTO "stand" VALUES(48,'rack/source/water',1700000125.0,NULL,'','the arm began to take it from ''source/water''');
+INSERT INTO "stand" VALUES(49,'night/pourer',1700000139.0,'left','','');
+INSERT INTO "stand" VALUES(50,'night/receiver',1700000142.0,NULL,'','interrupted: the arm began to carry it to ''pan''');
+CREATE INDEX entry_by_vessel on entry (vessel, id);
+CREATE TRIGGER entry_is_never_changed before update on entry begin
+    select raise(abort, 'account entries are append-only'); end;
+CREATE TRIGGER entry_is_never_deleted before delete on entry begin
+    select raise(abort, 'account entries are append-only'); end;
+COMMIT;
+pragma user_version = 0;
