@@ -252,26 +252,9 @@ def renewed(order: PourOrder, materials: Materials) -> PourOrder:
 
 
 def is_carried(order: PourOrder, laboratory: LaboratorySettings | None) -> bool:
-    """Whether an arm carries the vessels of an order.
-
-    Args:
-        order: the order.
-        laboratory: of its rig.
-
-    Raises:
-        OrderError: a vessel stands at no place for it.
-    """
-    if laboratory is None or not laboratory.places or order.amount is None or not (order.stand or order.position):
-        return False
-    places = [place.name for place in all_places(laboratory.places)]
-    for vessel, position in ((order.source, order.stand), (order.receiver, order.position)):
-        if position not in places or (vessel == order.receiver and "/" not in position):
-            stands = f"at '{position}'" if position else "nowhere"
-            raise OrderError(
-                f"{vessel}: stands {stands}, and the arm of laboratory '{laboratory.name}' pours from a source with a "
-                f"place into a cup in a rack; its places are {', '.join(places)}"
-            )
-    return True
+    """Whether the arm of a laboratory carries the vessels of an order."""
+    places = () if laboratory is None else laboratory.places
+    return bool(places) and order.amount is not None and bool(order.stand or order.position)
 
 
 def refusal(order: PourOrder, materials: Materials, laboratory: LaboratorySettings | None) -> str:
@@ -288,7 +271,14 @@ def refusal(order: PourOrder, materials: Materials, laboratory: LaboratorySettin
     reason = materials.refusal(order.source, order.receiver, order.liquid, order.amount, order.tolerance, pour=order.id)
     if reason or laboratory is None or not is_carried(order, laboratory):
         return reason
+    names = [place.name for place in all_places(laboratory.places)]
     for vessel, position in ((order.source, order.stand), (order.receiver, order.position)):
+        if position not in names or (vessel == order.receiver and "/" not in position):
+            stands = f"at '{position}'" if position else "nowhere"
+            raise OrderError(
+                f"{vessel}: stands {stands}, and the arm of laboratory '{laboratory.name}' pours from a source with a "
+                f"place into a cup in a rack; its places are {', '.join(names)}"
+            )
         if materials.account.identity(f"{laboratory.name}/{position}") != vessel:  # the rig had another laboratory
             return f"{vessel}: does not stand at '{position}' of laboratory '{laboratory.name}'; place it there again"
     places = LaboratoryPlaces(materials.account, laboratory.name)
