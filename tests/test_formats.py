@@ -16,6 +16,7 @@ from actors.balance import line_recording
 from actors.runtime.child_process import child_environment
 from orchestrator.catalogue import catalogue
 from orchestrator.daemon.state import daemon_store, state_backup
+from orchestrator.materials import vessel_account
 from orchestrator.materials.vessel_account import VesselAccount
 from orchestrator.records import journal_file
 from orchestrator.records.journal import JournalReader
@@ -57,6 +58,7 @@ def test_the_page_has_the_versions_that_this_program_writes() -> None:
     stated = {name.split(":")[0].split(" (")[0]: version for name, version in rows}
     assert stated["run"] == str(journal_file.FORMAT)
     assert stated["state of a daemon"] == str(daemon_store.FORMAT)
+    assert stated["account of vessels"] == str(vessel_account.FORMAT)
     assert stated["backup of a state"] == str(state_backup.FORMAT)
     assert stated["catalogue of a machine"] == str(catalogue.FORMAT)
     assert stated["recorded lines of a balance"] == str(line_recording.FORMAT)

@@ -118,7 +118,7 @@ def list_vessels(
         else:
             places = where.places()
             rows = [
-                {"id": content.vessel, "position": places[content.vessel].text if content.vessel in places else ""}
+                {"id": content.vessel, "position": places[content.vessel].shown() if content.vessel in places else ""}
                 | {"parts": where.composition(content.vessel), **content.content.model_dump()}
                 for content in where.all()
             ]

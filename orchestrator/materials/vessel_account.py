@@ -30,7 +30,7 @@ import json
 import math
 import sqlite3
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -207,6 +207,7 @@ class VesselPlace:
     Attributes:
         vessel: its name.
         time: of the entry, seconds since 1970.
+        laboratory: name of its laboratory; '' if it belongs to none.
         home: name under which the bench of its laboratory knows it: for a cup or source, the place where it belongs.
         place: name of the place; None: UNKNOWN, since a motion with it has begun and not ended.
         by: who made the entry; '' for a run.
@@ -216,29 +217,25 @@ class VesselPlace:
 
     vessel: str
     time: float
+    laboratory: str
     home: str
     place: str | None
     by: str = ""
     note: str = ""
     origin: str = ""
 
-    @property
-    def moving(self) -> bool:
-        """Whether a motion with it has begun, and was not noted as interrupted."""
-        return self.place is None and self.note.startswith(("the arm began to take it ", "the arm began to carry it "))
+    def shown(self, running: Collection[str] = ()) -> str:
+        """For tables: the place, or that it is unknown, and since which motion.
 
-    @property
-    def moving_text(self) -> str:
-        """The same as `text`, while a campaign moves it: "in the gripper, from 'left' to 'pan'"."""
-        if not self.moving:
-            return self.text
-        origin, (_, to, target) = f"from '{self.origin}'" if self.origin else "", self.note.partition(" to '")
-        return ", ".join(filter(None, ("in the gripper", origin + to + target)))
-
-    @property
-    def text(self) -> str:
-        """For tables: the place, or that it is unknown, and since which motion."""
-        return self.place if self.place is not None else f"UNKNOWN ({self.note})" if self.note else "UNKNOWN"
+        Args:
+            running: laboratories in which a campaign runs; it shows "in the gripper, from 'left' to 'pan'".
+        """
+        if self.place is not None:
+            return self.place
+        if self.laboratory in running and self.note.startswith(("the arm began to take", "the arm began to carry")):
+            origin, (_, to, target) = f"from '{self.origin}'" if self.origin else "", self.note.partition(" to '")
+            return ", ".join(filter(None, ("in the gripper", origin + to + target)))
+        return f"UNKNOWN ({self.note})" if self.note else "UNKNOWN"
 
 
 @dataclass(frozen=True)
@@ -302,10 +299,8 @@ class VesselAccount:
         Raises:
             OSError: the file can't be read.
         """
-        if not self._path.is_file():
-            return name
-        with self._connection() as connection:
-            return _identity(connection, name)
+        rows = self._rows(f"select {_IDENTITY}", (name,))
+        return str(rows[0][0]) if rows else name
 
     def content(self, vessel: str) -> VesselContent | None:
         """The last entry of a vessel; None without any.
@@ -335,10 +330,14 @@ class VesselAccount:
         return self._entries(f"where id in ({last}) and vessel not in ({addresses}) order by vessel", ())
 
     def _entries(self, condition: str, values: tuple[Any, ...]) -> list[VesselContent]:
+        return [_entry(row) for row in self._rows(f"select {_COLUMNS} from entry {condition}", values)]
+
+    def _rows(self, query: str, values: tuple[Any, ...]) -> list[tuple[Any, ...]]:
+        """Rows of the file; none before it exists."""
         if not self._path.is_file():
             return []
         with self._connection() as connection:
-            return _read(connection, condition, values)
+            return connection.execute(query, values).fetchall()
 
     def known(self, plan: DispensePlan) -> dict[str, KnownSource]:
         """Content and knowledge of a series' sources, by the names of the vessels.
@@ -402,8 +401,6 @@ class VesselAccount:
         _check_stated(mass, deviation)
         with self._writing() as connection:
             vessel = _identity(connection, vessel)
-            if mass == 0.0 and by and _composition(connection, vessel):
-                _add_component(connection, Component("", None, 0.0), vessel)  # emptied by a person, or another one
             before = _last(connection, vessel)
             held = liquid or ("" if before is None else before.liquid)
             if mass > 0.0 and not held:
@@ -414,10 +411,16 @@ class VesselAccount:
             entry = VesselContent(
                 vessel, now, kind, mass, deviation, liquid, by=by, note=note, weighed=now, knowledge=knowledge
             )
-            _write(connection, key or f"{kind} {vessel} {time.time_ns()}", entry)
+            is_new = _write(connection, key or f"{kind} {vessel} {time.time_ns()}", entry)
+            if is_new and mass == 0.0 and by and _composition(connection, vessel):
+                _add_component(connection, Component("", None, 0.0), vessel)  # emptied by a person, or another one
 
-    def lose(self, vessel: str) -> None:
+    def lose(self, vessel: str, liquid: str = "") -> None:
         """The content of a vessel is unknown from now on: a pour from it or into it has begun.
+
+        Args:
+            vessel: its name.
+            liquid: name of the liquid that is poured, for a vessel that was empty.
 
         Raises:
             OSError: the file can't be written.
@@ -425,7 +428,10 @@ class VesselAccount:
         with self._writing() as connection:
             vessel = _identity(connection, vessel)
             before = _last(connection, vessel) or _empty(vessel)
-            entry = replace(before, time=time.time(), kind="unknown", mass=None, deviation=0.0, pour="", note="")
+            entry = replace(
+                before, time=time.time(), kind="unknown", mass=None, deviation=0.0, liquid=before.liquid or liquid,
+                pour="", note="",
+            )  # fmt: skip
             _write(connection, f"unknown {vessel} {time.time_ns()}", entry)
 
     def pour_by_hand(
@@ -531,15 +537,9 @@ class VesselAccount:
         Raises:
             OSError: the file can't be read.
         """
-        if not self._path.is_file():
-            return {}
-        with self._connection() as connection:
-            origin = "select place from stand as former where former.vessel = stand.vessel and place is not null"
-            rows = connection.execute(
-                "select vessel, t, home, place, by, note, "
-                f"coalesce(({origin} order by id desc limit 1), '') from stand where {LATEST}"
-            ).fetchall()
-        return {str(row[0]): VesselPlace(*row) for row in rows}
+        origin = "select place from stand as former where former.vessel = stand.vessel and place is not null"
+        columns = f"vessel, t, laboratory, home, place, by, note, coalesce(({origin} order by id desc limit 1), '')"
+        return {row[0]: VesselPlace(*row) for row in self._rows(f"select {columns} from stand where {LATEST}", ())}
 
     def stands(self, laboratory: str) -> dict[str, str | None]:
         """The places of a laboratory's vessels, by the names that its bench has for them; None for UNKNOWN.
@@ -547,11 +547,7 @@ class VesselAccount:
         Raises:
             OSError: the file can't be read.
         """
-        if not self._path.is_file():
-            return {}
-        with self._connection() as connection:
-            of_laboratory = f"select home, place from stand where {LATEST} and laboratory = ?"
-            return dict(connection.execute(of_laboratory, (laboratory,)).fetchall())
+        return dict(self._rows(f"select home, place from stand where {LATEST} and laboratory = ?", (laboratory,)))
 
     def put(self, vessel: str, place: str | None, *, by: str = "", note: str = "") -> None:
         """Enter where a vessel stands; None for UNKNOWN. The entry is on disk when this returns.
@@ -603,7 +599,9 @@ class VesselAccount:
             if owner != vessel:
                 _take_over(connection, vessel, former, moved=place is None)
                 _put(connection, former, ("", ""), OUTSIDE, by, f"its id is {vessel}")
-            _put(connection, vessel, address, *((home, by, "") if by else (place, by, note)))
+            if by:
+                place, note = home, ""
+            _put(connection, vessel, address, place, by, note)
 
     # ---- entries of runs
 
@@ -766,7 +764,7 @@ class LaboratoryPlaces:
         """See `PlaceRecord.content`."""
         with _writable():
             if mass is None:
-                self._account.lose(self._prefix + vessel)
+                self._account.lose(self._prefix + vessel, liquid)
             else:
                 self._account.weigh(self._prefix + vessel, max(mass, 0.0), deviation, liquid=liquid)
 
@@ -838,8 +836,8 @@ def _take_over(connection: sqlite3.Connection, vessel: str, former: str, *, move
         former: address of the one without an id.
         moved: whether a motion with it was interrupted: it may have spilled.
     """
-    held, parts = _last(connection, former), _composition(connection, former)
-    if held is None or (held.mass == 0.0 and not any(part.liquid and part.mass != 0.0 for part in parts)):
+    held, parts = _last(connection, former) or _empty(former), _composition(connection, former)
+    if held.mass == 0.0 and not any(part.liquid and part.mass != 0.0 for part in parts):
         return
     own = _last(connection, vessel) or _empty(vessel)
     certain = False
@@ -910,14 +908,14 @@ def _add_component(connection: sqlite3.Connection, component: Component, vessel:
 _COLUMNS = "vessel, t, kind, mass, deviation, liquid, pour, by, note, weighed, knowledge"
 
 
-def _read(connection: sqlite3.Connection, condition: str, values: tuple[Any, ...]) -> list[VesselContent]:
-    rows = connection.execute(f"select {_COLUMNS} from entry {condition}", values).fetchall()
-    return [VesselContent(*(*row[:-1], None if row[-1] is None else json.loads(row[-1]))) for row in rows]
+def _entry(row: tuple[Any, ...]) -> VesselContent:
+    return VesselContent(*(*row[:-1], None if row[-1] is None else json.loads(row[-1])))
 
 
 def _last(connection: sqlite3.Connection, vessel: str) -> VesselContent | None:
-    entries = _read(connection, "where vessel = ? order by id desc limit 1", (vessel,))
-    return entries[0] if entries else None
+    of_vessel = f"select {_COLUMNS} from entry where vessel = ? order by id desc limit 1"
+    row = connection.execute(of_vessel, (vessel,)).fetchone()
+    return None if row is None else _entry(row)
 
 
 def _write(connection: sqlite3.Connection, key: str, row: VesselContent) -> bool:

@@ -189,14 +189,15 @@ class Materials:
             raise MaterialError("; ".join(f"{p.where or 'shape'}: {p.message}" for p in error.problems)) from None
         except (VesselError, ValueError) as error:
             raise MaterialError(f"shape: {error}") from None
-        address, place = self._address(position), self.account.places().get(key)
-        if place is not None and place.home != address[1]:
+        address, home = self._address(position), self._homes().get(key)
+        if home not in (None, address[1]):
             raise MaterialError(f"vessel '{key}' is registered already, at another position")
         if position and (other := self.account.identity("/".join(address))) not in (key, "/".join(address)):
             raise MaterialError(f"position {address[1]} is taken by vessel {other}; move that one first")
         self._add("vessel", key, code, shape=text, capacity=float(capacity))
-        self.account.weigh(key, 0.0, 0.0, by=by, note="registered as empty", key=f"registered {key}")
-        if place is None and position:
+        if self.account.content(key) is None:  # also if an earlier registration was interrupted here
+            self.account.weigh(key, 0.0, 0.0, by=by, note="registered as empty", key=f"registered {key}")
+        if home is None and position:
             self._assign(key, address, by)
 
     def _add(self, table: str, key: str, code: str, **values: Any) -> None:
@@ -256,7 +257,8 @@ class Materials:
         if "/" not in vessel:
             registered = self.vessel(vessel)
             vessel, liquid = registered.id, self.liquid_id(liquid) if liquid else self.content(registered.id).liquid
-            volume = 0.0 if not liquid or liquid == MIXTURE else mass / self.liquid(liquid).density
+            is_registered = bool(self._store.rows("select 1 from liquid where id = ?", liquid))  # runs have others, too
+            volume = mass / self.liquid(liquid).density if is_registered else 0.0
             if volume > registered.capacity:
                 raise MaterialError(
                     f"{registered.id}: holds {1e6 * registered.capacity:.0f} ml, and {1e6 * volume:.0f} ml are stated"
@@ -303,28 +305,32 @@ class Materials:
 
         A campaign's source with one of these names is that vessel.
         """
-        places, rigs = self.account.places(), self._rigs()
+        homes, rigs = self._homes(), self._rigs()
         names: dict[str, str] = {}
         for row in self._store.rows("select id, coalesce(code, '') as code from vessel"):
-            home = places[row["id"]].home if row["id"] in places else ""
+            home = homes.get(row["id"], "")
             if rigs.get(home, rig) == rig:
                 names |= {name: row["id"] for name in (home, row["code"], row["id"]) if name}
         return names
 
+    def _homes(self) -> dict[str, str]:
+        """Positions where registered vessels belong, by their ids; '' if they belong nowhere."""
+        return {name: place.home for name, place in self.account.places().items() if "/" not in name}
+
     def _rigs(self) -> dict[str, str]:
+        """Rigs of the positions."""
         return {row["id"]: row["rig"] for row in self._store.rows("select id, rig from position")}
 
     # ---- look-up
 
     def vessel(self, key: str) -> RegisteredVessel:
         """Return a vessel by its id or code, or by the position where it belongs. Raises MaterialError."""
-        places = self.account.places()
+        homes = self._homes()
         if not self._store.rows("select 1 from vessel where ? in (id, code)", key):
             for position in self._store.rows("select id from position where ? in (id, code)", key):
-                standing = [name for name, place in places.items() if place.home == position["id"]]
-                key = next((name for name in standing if "/" not in name), key)
+                key = next((vessel for vessel, home in homes.items() if home == position["id"]), key)
         row = self._row("vessel", key)
-        home = places[row["id"]].home if row["id"] in places else ""
+        home = homes.get(row["id"], "")
         return RegisteredVessel(row["id"], row["code"] or "", json.loads(row["shape"]), row["capacity"], home)
 
     def liquid(self, key: str, mass: float = 0.1) -> Liquid:
@@ -365,12 +371,12 @@ class Materials:
         ):
             held = contents.pop(row["id"], None) or VesselContent(row["id"], 0.0, "weighed", 0.0, 0.0)
             place, promised = places.get(row["id"]), 1e3 * self.promised(row["id"])
-            position = "" if place is None else place.text if place.place is None else place.home
+            position = "" if place is None else place.home if place.place is not None else place.shown(running)
             vessels.append(VesselOut(**row, position=position, content=held.content, promised_g=promised))
         sources = []
         for name, held in contents.items():
             place, in_use = places.get(name), name.partition("/")[0] in running
-            position = "" if place is None else place.moving_text if in_use else place.text
+            position = "" if place is None else place.shown(running)
             sources.append(SourceOut(id=name, position=position, in_use=in_use, content=held.content))
         liquids = [
             LiquidOut(id=row["id"], code=row["code"] or "", properties=json.loads(row["properties"]))

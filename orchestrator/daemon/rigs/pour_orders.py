@@ -521,14 +521,11 @@ def _weighed(order: PourOrder, pour: RunPour, measured: PourMeasurement, deviati
 
 @dataclass(frozen=True)
 class SettledOrder:
-    """A pour as its journal records it, with the deviation of one weighing [kg], and whether an arm carried its
-    vessels: then its run has accounted for them.
-    """
+    """A pour as its journal records it, with the deviation of one weighing [kg]."""
 
     order: PourOrder
     pour: RunPour
     deviation: float
-    carried: bool
 
 
 def settled_pour(run: Path, snapshot: Path, rig: Rig) -> SettledOrder | None:
@@ -548,8 +545,9 @@ def settled_pour(run: Path, snapshot: Path, rig: Rig) -> SettledOrder | None:
     pours = read_record(run).pours
     if not pours:
         return None
-    order, laboratory = PourOrder.read(snapshot), rig.spec or load_laboratory(shipped(VIRTUAL))
-    return SettledOrder(order, pours[0], weighing_deviation(laboratory), is_carried(order, rig.spec))
+    return SettledOrder(
+        PourOrder.read(snapshot), pours[0], weighing_deviation(rig.spec or load_laboratory(shipped(VIRTUAL)))
+    )
 
 
 class PlacedOrder(BaseModel):
@@ -608,7 +606,9 @@ class OrderBook:
         )
 
     def settle(self, item: QueueItem, settled: SettledOrder | None, *, ended: bool) -> None:
-        """Store the result of a pour, and enter it in the account unless its run has. A second call changes nothing.
+        """Store the result of a pour, and enter it in the account of both vessels unless an arm has carried them.
+
+        The run of a pour with carried vessels enters it itself. A second call changes nothing.
 
         Args:
             item: campaign of the order.
@@ -633,6 +633,7 @@ class OrderBook:
             moved = Transfer(None, None)
         else:
             return
-        if moved is not None and not settled.carried:
+        carried = pour.request.dose is not None and bool(pour.request.dose.cup)
+        if moved is not None and not carried:
             self._materials.account.transfer(placed.id, placed.source, placed.receiver, moved, by=item.by)
         self._store.write("update pour_order set result = ? where campaign = ?", result.model_dump_json(), item.id)

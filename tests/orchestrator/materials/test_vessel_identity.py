@@ -53,6 +53,10 @@ def finish(places: LaboratoryPlaces, cup: str, liquid: str = "water") -> None:
     places.put(cup, cup)
 
 
+def fail(*_: Any, **__: Any) -> None:
+    raise OSError("interrupted")
+
+
 def liquids(places: LaboratoryPlaces, cup: str) -> dict[str, float | None]:
     return {name: mass for name, (mass, _) in places.composition(cup).items() if name}
 
@@ -120,6 +124,64 @@ def test_a_cup_that_a_person_moves_keeps_its_content_and_leaves_none_at_its_form
         assert places.composition("rack/B2") == {}
 
 
+def test_a_cup_that_is_registered_again_keeps_what_was_dosed_into_it(tmp_path: Path) -> None:
+    """A client may repeat its registration, as after a lost answer."""
+    account, places = opened(tmp_path)
+    with station(tmp_path) as materials:
+        register(materials)
+        begin(places, "rack/A1")
+        finish(places, "rack/A1")
+        register(materials)
+    assert (mass(account, "cup-1"), liquids(places, "rack/A1")) == (0.03, {"water": 0.03})
+
+
+def test_a_cup_whose_registration_was_interrupted_keeps_what_was_dosed_before_it_is_repeated(tmp_path: Path) -> None:
+    account, places = opened(tmp_path)
+    with station(tmp_path) as materials:
+        register(materials)
+        shape = {"profile": {"unit": "mm", "inner": [[0, 0], [28, 0], [28, 80]], "wall": "3 mm", "floor": "3 mm"}}
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(VesselAccount, "weigh", fail)
+            with pytest.raises(OSError, match="interrupted"):
+                materials.add_vessel("cup-3", "", shape, "", "ada")
+        materials.place("cup-3", "rack/B2", "ada")
+        begin(places, "rack/B2")
+        finish(places, "rack/B2")
+        materials.add_vessel("cup-3", "", shape, "rack/B2", "ada")
+    assert (mass(account, "cup-3"), liquids(places, "rack/B2")) == (0.03, {"water": 0.03})
+
+
+def test_a_cup_into_which_a_run_has_dosed_a_liquid_of_its_own_can_be_weighed(tmp_path: Path) -> None:
+    _, places = opened(tmp_path)
+    with station(tmp_path) as materials:
+        register(materials)
+        begin(places, "rack/A1", "ethanol 70 %")
+        materials.weigh("cup-1", 0.02, 1e-4, "", "ada")
+        assert (materials.content("cup-1").mass, materials.content("cup-1").liquid) == (0.02, "ethanol 70 %")
+        materials.weigh("cup-1", 0.0, 0.0, "", "ada")
+        assert liquids(places, "rack/A1") == {}
+
+
+def test_a_registered_cup_is_shown_in_the_gripper_while_a_campaign_moves_it(tmp_path: Path) -> None:
+    _, places = opened(tmp_path)
+    with station(tmp_path) as materials:
+        register(materials)
+        places.put("rack/A1", None, "the arm began to take it from 'rack/A1'")
+        shown = [materials.everything(running).vessels[0].position for running in (["rack"], ["another"])]
+        assert shown == ["in the gripper, from 'rack/A1'", "UNKNOWN (the arm began to take it from 'rack/A1')"]
+        places.put("rack/A1", "pan")
+        assert materials.everything(["rack"]).vessels[0].position == "rack/A1"
+
+
+def test_a_dose_that_began_with_an_entry_of_the_liquid_only_is_taken_over(tmp_path: Path) -> None:
+    account, places = opened(tmp_path)
+    places.add_component("rack/A1", "water", None, 0.0, "source/water")  # killed before the content was entered
+    with station(tmp_path) as materials:
+        register(materials)
+    assert liquids(places, "rack/A1") == {"water": None}
+    assert [part.liquid for part in account.composition("cup-1")] == ["water"]
+
+
 def test_a_filled_cup_without_an_id_is_the_one_that_gets_its_place(tmp_path: Path) -> None:
     """What 'decant run' has dosed before the cup was registered counts."""
     account, places = opened(tmp_path)
@@ -134,6 +196,20 @@ def test_a_filled_cup_without_an_id_is_the_one_that_gets_its_place(tmp_path: Pat
         assert liquids(places, "rack/A1") == {"water": 0.03}
         materials.weigh("cup-1", 0.0, 0.0, "", "ada")
         assert liquids(places, "rack/A1") == {}
+
+
+@pytest.mark.parametrize(
+    ("held", "place", "expected"), [(0.03, "rack/A1", 0.03), (0.035, "rack/A1", None), (0.03, None, None)]
+)
+def test_a_content_is_kept_if_two_accounts_of_it_agree_and_no_motion_was_interrupted(
+    held: float, place: str | None, expected: float | None, tmp_path: Path
+) -> None:
+    account, places = opened(tmp_path)
+    account.weigh("cup-1", 0.03, 1e-4, liquid="water")
+    places.content("rack/A1", held, 1e-4, "water")
+    places.put("rack/A1", place, "the arm began to take it from 'rack/A1'")
+    account.assign("cup-1", ("rack", "rack/A1"), by="ada")
+    assert mass(account, "cup-1") == expected
 
 
 def test_a_cup_that_gets_an_id_in_the_middle_of_a_dose_has_that_dose(tmp_path: Path) -> None:
@@ -157,8 +233,11 @@ def test_places_with_the_same_name_of_two_laboratories_hold_two_vessels(tmp_path
     assert places.stands() == others.stands() == {"rack/A1": "rack/A1"}
 
 
-def test_a_liquid_that_was_poured_by_hand_on_top_of_another_one_is_in_the_cup(tmp_path: Path) -> None:
+@pytest.mark.parametrize("vessel", ["rack/rack/A1", "cup-1"])
+def test_a_liquid_that_was_poured_by_hand_on_top_of_another_one_is_in_the_cup(vessel: str, tmp_path: Path) -> None:
     account, places = opened(tmp_path)
+    if vessel == "cup-1":
+        account.assign(vessel, ("rack", "rack/A1"), by="ada")
     begin(places, "rack/A1", "oil")
     finish(places, "rack/A1", "oil")
     account.weigh("jar/water", 0.1, 1e-4, liquid="water")
@@ -166,6 +245,7 @@ def test_a_liquid_that_was_poured_by_hand_on_top_of_another_one_is_in_the_cup(tm
         account.pour_by_hand("m-1", "jar/water", "rack/rack/A1", 0.01, 1e-4, by="ada")
     assert liquids(places, "rack/A1") == {"oil": 0.03, "water": 0.01}
     assert places.held("rack/A1") == (pytest.approx(0.04), pytest.approx(2**0.5 * 1e-4))
+    assert {one.vessel for one in account.all()} == {vessel, "jar/water"}
 
 
 # ---- a state of an earlier format
@@ -319,6 +399,27 @@ def test_a_conversion_that_is_killed_at_any_statement_loses_no_dose_and_is_compl
         moved(folder)
         check_moved(folder)
     assert statement > 100
+
+
+def test_a_conversion_by_several_programs_at_once_loses_no_dose(former: Path) -> None:
+    """Runs at the terminal open the file while the daemon starts."""
+    reading, writing = os.pipe()
+    children = []
+    for _ in range(4):
+        if (child := os.fork()) == 0:
+            try:
+                os.read(reading, 1)
+                kinds = liquids(opened(former)[1], "rack/A2").keys()
+                os._exit(0 if kinds == {"water"} else 1)
+            finally:
+                os._exit(2)
+        children.append(child)
+    os.write(writing, b"4444")
+    moved(former)
+    assert [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children] == [0, 0, 0, 0]
+    os.close(reading)
+    os.close(writing)
+    check_moved(former)
 
 
 def test_a_program_of_the_former_format_that_still_runs_cannot_enter_anything_for_a_vessel_with_an_id(

@@ -193,11 +193,12 @@ def test_a_share_has_no_interval_if_one_of_its_doses_has_none() -> None:
     assert {c.share_half_interval for c in result.model_copy(update={"doses": doses}).components()} == {None}
 
 
-@pytest.mark.parametrize(("carried", "ordered"), [(False, False), (True, False), (True, True)])
-def test_after_the_answer_the_account_knows_the_cup(carried: bool, ordered: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("carried", [False, True])
+@pytest.mark.parametrize("vessels", ["without ids", "with ids", "of an order"])
+def test_after_the_answer_the_account_knows_the_cup(carried: bool, vessels: str, tmp_path: Path) -> None:
     account, (_, events) = VesselAccount(tmp_path / "vessels.sqlite"), dosed(10.2, "received 38 ± 2 g")
-    ids = {"rack/A1": "cup-1", "source/water": "can", "source/oil": "jug"} if ordered else {}
-    for place, vessel in ids.items():
+    ids, ordered = {"rack/A1": "cup-1", "source/water": "can", "source/oil": "jug"}, vessels == "of an order"
+    for place, vessel in ids.items() if vessels != "without ids" else ():
         account.assign(vessel, ("bench", place), by="ada")
     follow = account.follow(replace(SERIES, laboratory="", vessels=ids) if ordered else SERIES, carried=carried)
     if carried:  # the bench enters its own doses, and that the second one has begun
