@@ -231,18 +231,19 @@ class CarryingBench(HeldBench):
         return PourMeasurement(source.mass, 0.0, left, {"dose": {"received": 0.0301, "left": [left, 4e-4]}})
 
 
+def carrying() -> HeldLaboratory:
+    """A laboratory whose arm carries the cups, and whose first pour does not end by itself."""
+    laboratory = HeldLaboratory(ToySimulators(), CarryingBench(), ToyOptimizer())
+    laboratory.bench.go.clear()
+    return laboratory
+
+
 async def test_an_order_names_the_positions_of_a_rack_whose_cup_the_arm_carries(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DECANT_STATE", str(tmp_path / "state"))
     rigs = (Rig("left", RACK, load_laboratory(RACK)),)
-
-    def make() -> HeldLaboratory:
-        laboratory = HeldLaboratory(ToySimulators(), CarryingBench(), ToyOptimizer())
-        laboratory.bench.go.clear()
-        return laboratory
-
-    async with serving(tmp_path, make, rigs=rigs) as served:
+    async with serving(tmp_path, carrying, rigs=rigs) as served:
         await rack_set_up(served)
         wanted = order(source="source/water", receiver="rack/A1", amount="30 g")
         tried = await served.post("/pours", wanted | {"predict": True, "dry_run": True})
@@ -265,6 +266,34 @@ async def test_an_order_names_the_positions_of_a_rack_whose_cup_the_arm_carries(
         assert terminal.composition("rack/A1")["water"][0] == 0.0301
         again = await served.post("/pours", order("order-2", **{**wanted, "id": "order-2"}), status=409)
         assert "cup-1: has 30.1 g of water already, and no liquid is dosed into a cup twice" in again["detail"]
+
+
+async def test_what_an_operator_enters_for_an_order_in_a_rack_is_in_its_vessels_and_is_not_dosed_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DECANT_STATE", str(tmp_path / "state"))
+    rigs = (Rig("left", RACK, load_laboratory(RACK)),)
+    wanted = order(source="can", receiver="cup-1", amount="30 g")
+    async with serving(tmp_path, carrying, rigs=rigs) as served:
+        await rack_set_up(served)
+        key = (await served.post("/pours", wanted))["campaign"]
+        await served.pouring()
+        await served.post("/emergency-stop")
+        await until_pour(served, "order-1", "unknown")
+        assert (await content(served, "cup-1"))["mass_g"] is None
+        await served.post("/emergency-stop/clear", role=_admin())
+        await served.until(key, "unknown")
+        await served.post(f"/campaigns/{key}/resume")
+        question = await served.question()
+        await served.post(f"/questions/{question['id']}/answer", {"answer": "received 29 ± 1 g"})
+        done = await until_pour(served, "order-1", "weighed")
+        assert done["result"]["received_g"] == pytest.approx(29.0)
+        cup, can = await content(served, "cup-1"), await content(served, "can")
+        assert cup["mass_g"] == pytest.approx(29.0)
+        assert can["mass_g"] == pytest.approx(300.0 - 29.0, abs=1.5)  # and what such a dose loses
+        told = await served.post("/pours", wanted | {"id": "order-2"}, status=409)
+        assert "cup-1: has 29.0 g of water already" in told["detail"]
+    assert begun(tmp_path) == 1
 
 
 async def test_a_cup_in_a_rack_that_is_unknown_or_has_the_liquid_is_refused(tmp_path: Path) -> None:
