@@ -226,12 +226,13 @@ class KilledNight:
         LiquidSupply.top_up = topped  # type: ignore[method-assign]
         flows, lay_out, before = FollowedBench.flows, Hands._lay_out, self._true()
 
-        async def flown(bench: FollowedBench) -> None:
+        async def flown(bench: FollowedBench, *show: Any) -> None:
             nonlocal flowing
-            assert bench._flow is not None
+            assert bench._dose is not None
+            scene, _, _ = bench._dose
             flowing = True
-            self._note("flows", [bench.contents.pourer, bench._flow.liquid.name, bench.contents.receiver])
-            await flows(bench)
+            self._note("flows", [bench.contents.pourer, scene.liquid.name, bench.contents.receiver])
+            await flows(bench, *show)
 
         def laid_out(hands: Hands, details: Any) -> None:
             lay_out(hands, details)
