@@ -15,9 +15,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
-import select
-import socket
 import sys
 import threading
 import time
@@ -35,6 +32,7 @@ from franky_sim.franka_robot_protocol import (
 )
 from franky_sim.mujoco_simulator import MujocoSimulator
 
+from actors.emulators.franka.client_reminder import ClientReminder
 from actors.runtime.bench_clock import LONGEST_STAND, SharedClock
 
 TICK = 1e-3
@@ -53,9 +51,6 @@ SILENCE = 0.2
 """Wall time after which a moving robot makes a cycle although the clock of the bench stands, or its client is late [s]:
 libfranka counts a second of silence as a lost connection."""
 
-REMINDER = 0.05
-"""Wall time between two reminders of a client [s]."""
-
 KEPT = 600.0
 """Time for which samples are kept [s]."""
 
@@ -69,8 +64,7 @@ class Ports(franka_robot_server.FrankaRobotServer):  # type: ignore[misc]  # it 
     reflex = unplugged = False
     quiet = 0
     """States that were sent since the last command of a motion; 0 before its first one."""
-    reminder: socket.socket
-    """To the process that runs `_remind`."""
+    reminder: ClientReminder
 
     def start_motion(self, *arguments: Any) -> None:
         """Begin a motion."""
@@ -87,13 +81,13 @@ class Ports(franka_robot_server.FrankaRobotServer):  # type: ignore[misc]  # it 
         self.quiet += self.quiet > 0
         if self._FrankaServer__message_id == 1:
             size = 8 + len(self._get_state_bytes())
-            client = json.dumps([size, self._FrankaServer__client_address, self._FrankaServer__client_udp_port])
-            socket.send_fds(self.reminder, [client.encode()], [self._FrankaServer__udp_socket.fileno()])
+            client = self._FrankaServer__client_address, self._FrankaServer__client_udp_port
+            self.reminder.remind(client, size, self._FrankaServer__udp_socket)
 
     def reset_state(self) -> None:
         """Let go of the client."""
         super().reset_state()
-        self.reminder.send(b"null")
+        self.reminder.forget()
 
     @property
     def late(self) -> bool:
@@ -211,28 +205,6 @@ class VirtualFranka:
         self._ended.set()
 
 
-def _remind(channel: socket.socket) -> None:
-    """Send a client states that it skips, with an old number; without any for a second, it gives up.
-
-    This is a process of its own, since a simulator that works all the time waits for a processor of a busy host for
-    longer than that. A new client is a message with its port; it ends with the channel.
-    """
-    client: tuple[socket.socket, bytes, tuple[Any, ...]] | None = None
-    while True:
-        if not select.select([channel], [], [], REMINDER)[0]:
-            if client is not None:
-                with contextlib.suppress(OSError):
-                    client[0].sendto(*client[1:])
-            continue
-        text, handles, *_ = socket.recv_fds(channel, 200, 1)
-        if not text:
-            return
-        client = None
-        if handles:
-            size, *address = json.loads(text)
-            client = socket.socket(fileno=handles[0]), bytes(size), tuple(address)
-
-
 def main() -> None:
     """Serve until the input ends."""
     parser = argparse.ArgumentParser()
@@ -242,19 +214,13 @@ def main() -> None:
     parser.add_argument("--joints", required=True)
     chosen = parser.parse_args()
     joints = [float(q) for q in chosen.joints.split(",")]
-    Ports.reminder, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    if not os.fork():
-        os.setsid()  # a group of its own for the scheduler
-        Ports.reminder.close()
-        os.closerange(0, 3)
-        _remind(channel)
-        os._exit(0)
-    channel.close()
+    Ports.reminder = ClientReminder()
     with contextlib.redirect_stdout(sys.stderr), MujocoSimulator() as simulator:
         simulator.add_robot(initial_q=joints)
         robot = VirtualFranka(simulator, chosen.address, SharedClock(chosen.clock), chosen.time_scale)
         _say(json.dumps({"ready": chosen.address}))
         robot.run()
+        Ports.reminder.close()
         SharedClock.remove(chosen.clock)
 
 

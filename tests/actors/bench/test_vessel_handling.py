@@ -154,7 +154,9 @@ def test_a_vessel_lost_on_its_way_is_unknown_and_ends_the_consent(open_stage: Op
         with pytest.raises(NotPouredError, match="the gripper may have lost the receiver"):
             await pour(stage)
         stage.before["laid_out"] = look
-        assert account(tmp_path).places()["virtual/receiver"].text.startswith("UNKNOWN (interrupted: the arm began to ")
+        assert (
+            account(tmp_path).places()["virtual/receiver"].shown().startswith("UNKNOWN (interrupted: the arm began to ")
+        )
         await pour(stage)
         return seen
 

@@ -240,7 +240,7 @@ def test_a_client_is_not_lost_while_the_clock_of_the_bench_or_the_simulator_stan
         clock.withdraw("liquid")
         until(lambda: robot.state.time.to_sec() > stood + 0.2, "it does not go on")
         process.send_signal(signal.SIGSTOP)
-        time.sleep(3.0)
+        time.sleep(3.0)  # likewise
         process.send_signal(signal.SIGCONT)
         until(lambda: robot.state.time.to_sec() > stood + 0.4, "it does not go on after the simulator stood")
         assert robot.is_in_control
