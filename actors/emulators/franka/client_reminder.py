@@ -27,9 +27,14 @@ class ClientReminder:
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             number = theirs.fileno()
-            command = python_module(__name__, str(number))
             self._process = ChildProcess(
-                command, input=False, output=False, errors="shown", inherited=(number,), dies_with_parent=True
+                python_module(__name__, str(number)),
+                input=False,
+                output=False,
+                errors="shown",
+                inherited=(number,),
+                dies_with_parent=True,
+                prompt=True,
             )
 
     def remind(self, client: tuple[str, int], size: int, sender: socket.socket) -> None:
