@@ -355,12 +355,13 @@ class JointArm:
     def _read(self) -> JointReading:
         reading = self.robot.read()
         self._last_time = reading.time
-        self._state = replace(
-            self._state,
-            joints=tuple(reading.joints.tolist()),
-            tilt=float(leans(reading.joints[None], self._spec)[0]),
-        )
+        self._show(reading)
         return reading
+
+    def _show(self, reading: JointReading, **motion: Any) -> None:
+        """Report a reading, at once with how far the motion is: a tilt of another time would be a jump."""
+        motion = {"tilt": float(leans(reading.joints[None], self._spec)[0]), **motion}
+        self._state = replace(self._state, joints=tuple(reading.joints.tolist()), **motion)
 
     def _go(self, segment: MotionSegment, move: _Move | None = None) -> ExecutedPath:
         """Execute one motion to its end.
@@ -420,8 +421,8 @@ class JointArm:
         """Readings of a motion, each newer than the one before; their times count from its begin."""
         begun, arrived = self._last_time, self._clock.now
         while True:
-            reading = self._read()
-            now = reading.time - begun
+            reading = self.robot.read()
+            self._last_time, now = reading.time, reading.time - begun
             if now > times[-1]:
                 times.append(now)
                 joints.append(reading.joints)
@@ -443,9 +444,7 @@ class JointArm:
         self._begin(path)
         for reading in self._readings(times, joints):
             now, clock = reading.time, min(reading.time, path.duration)
-            self._state = replace(
-                self._state, time=clock, fraction=clock / path.duration, phase=segment.phase(min(clock, now))
-            )
+            self._show(reading, time=clock, fraction=clock / path.duration, phase=segment.phase(min(clock, now)))
             held_up = now - before
             before = now
             if not reason[0] and (self._ordered or reading.problem or held_up > self._longest_gap):
@@ -600,7 +599,7 @@ class VelocityArm(JointArm):
             left = max((last if back else dose.highest) - tilt, 0.0)
             self._robot.turn(speeds, min(HOLD, left / speed) if speed > 0.0 else HOLD)
             measured = first + rejoin(track, reading.joints)[0]
-            self._state = replace(self._state, time=before, tilt=measured)
+            self._show(reading, time=before, tilt=measured)
             if back and measured < first + AT_END and _stand(times, joints):
                 self.robot.halt()
                 if self._ordered:

@@ -38,6 +38,7 @@ def path():
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beside busy processes the joints of this arm, which has the wall clock, come late."""
     monkeypatch.setattr("actors.arm.joint_driver.SILENCE", PATIENCE)
+    monkeypatch.setattr("tests.plugins.decant_example.ros2_arm.SILENCE", PATIENCE)
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -84,6 +85,24 @@ def test_the_executed_tilt_is_the_planned_one(speed: float, arm: VelocityArm) ->
     lags = np.linspace(-0.02, 0.02, 41)
     errors = [np.abs(path.pour.at(executed.times - lag) - executed.joints).max() for lag in lags]
     assert min(errors) < (0.3 + 2e-3 * speed) * DEG  # a command holds for 10 ms, so that ramps are up to 2 ms off
+
+
+def test_a_state_is_of_one_reading(arm: VelocityArm, path) -> None:
+    """A new tilt at the time of the reading before would be a jump to everyone who compares states."""
+    arm.release()
+    arm.move_to_start(path)
+    tilts: dict[float, set[float]] = {}
+    usual = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        pouring = Call(arm.execute, path)
+        while pouring.is_alive():
+            state = arm.state()
+            tilts.setdefault(state.time, set()).add(state.tilt)
+    finally:
+        sys.setswitchinterval(usual)
+    assert pouring.ended() is None
+    assert {time for time, seen in tilts.items() if len(seen) > 1} <= {0.0, path.pour.duration}  # it rests at both ends
 
 
 def test_a_robot_that_drifts_creeps_on_in_a_dose(arm: VelocityArm, path) -> None:

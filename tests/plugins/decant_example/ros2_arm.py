@@ -20,6 +20,7 @@ JOINTS = [f"joint{k}" for k in range(1, 8)]
 STATES = "/joint_states", "sensor_msgs/msg/JointState"
 ACTION = "/joint_trajectory_controller/follow_joint_trajectory", "control_msgs/action/FollowJointTrajectory"
 THREADS = "/rosbridge_websocket:send_action_goals_in_new_thread"
+SILENCE = 1.0  # s without joints after which the robot counts as lost
 
 
 class Ros2Settings(ChainArmSettings):
@@ -73,7 +74,7 @@ class Ros2Robot:
             self._received = time.monotonic()
 
     def read(self) -> JointReading:
-        if self._ros is None or not self._ros.is_connected or time.monotonic() > self._received + 1.0:
+        if self._ros is None or not self._ros.is_connected or time.monotonic() > self._received + SILENCE:
             raise ConnectionError(f"no joints from rosbridge at {self._spec.address}:{self._spec.port}")
         stamp, joints = self._reading
         return JointReading(stamp, joints, self._problem)
