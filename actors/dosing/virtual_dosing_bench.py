@@ -46,6 +46,18 @@ TIME_STEP = 0.005
 LONGEST_DOSE = 90.0
 """[s]"""
 
+SPEED_LIMIT, ACCELERATION, RETURN_SPEED = math.radians(90.0), math.radians(600.0), math.radians(60.0)
+"""Of the arm's tilt [rad/s], [rad/s²]; the last one without news, and at the end of a dose."""
+
+SLOSH_MODE = 1.841
+"""First zero of J₁', which gives the frequency of the first slosh mode of a deep cylinder (Ibrahim 2005)."""
+
+SLOSH_DAMPING, SLOSH_LEVER = 0.08, 0.08
+"""Damping of that mode per ω, and distance of the liquid from the axis of the tilt [m]."""
+
+RECEIVER_RADIUS = 0.035
+"""[m]"""
+
 
 class Doser(Protocol):
     """Anything that decides the tilt of one dose."""
@@ -110,17 +122,67 @@ class TrueScale:
 
 
 @dataclass(frozen=True)
+class Lip:
+    """How a lip lets go of a stream.
+
+    Attributes:
+        critical_weber: Weber number below which a part of the stream clings to the outside.
+        clinging: largest share that clings.
+    """
+
+    critical_weber: float
+    clinging: float
+
+
+SPOUT, ROUND_RIM = Lip(1.0, 0.25), Lip(3.0, 0.08)
+
+
+@dataclass(frozen=True)
+class DrainingFilm:
+    """Liquid that stays on the wall for a while.
+
+    Attributes:
+        share: of what flows.
+        time: constant with which it drains [s].
+    """
+
+    share: float
+    time: float
+
+
+THIN_FILM, THICK_FILM = DrainingFilm(0.03, 0.25), DrainingFilm(0.07, 0.7)
+"""Of a thin and of a thick liquid."""
+
+
+@dataclass(frozen=True)
 class DosingFault:
     """A disturbance; `at` is the time after the first flow [s].
 
     Attributes:
         kind: 'knock' (5 g for 0.2 s), 'unstable' (the balance never rests), 'line cut' (no reading any more), 'stall'
             (the controller pauses for 0.7 s), 'killed' (it never comes back), 'miss' (the stream misses the receiver),
-            'receiver missing'.
+            'receiver missing', 'none'.
     """
 
-    kind: Literal["knock", "unstable", "line cut", "stall", "killed", "miss", "receiver missing"]
+    kind: Literal["knock", "unstable", "line cut", "stall", "killed", "miss", "receiver missing", "none"]
     at: float = 0.5
+
+    def acts(self, kind: str, time: float, first_flow: float, lasting: float = math.inf) -> bool:
+        """Whether a fault of this kind acts at a time [s], which lasts so long [s]."""
+        return self.kind == kind and first_flow + self.at < time < first_flow + self.at + lasting
+
+    def silences(self, time: float, first_flow: float) -> bool:
+        """Whether the controller gives no command."""
+        return self.acts("killed", time, first_flow) or self.acts("stall", time, first_flow, 0.7)
+
+    def load(self, time: float, first_flow: float, normal: float) -> float:
+        """What it adds to the load on the balance [kg]; `normal` is a standard normal number."""
+        if self.kind == "knock" and 0.0 <= time - first_flow - self.at < 0.2:
+            return 5e-3
+        return 2e-3 * math.sin(8.0 * time) + 1e-3 * normal if self.kind == "unstable" else 0.0
+
+
+NO_FAULT = DosingFault("none")
 
 
 @dataclass(frozen=True)
@@ -360,88 +422,64 @@ class VirtualDosingBench:
         self._wetness *= 0.85
         return tuple(readings)
 
-    def dose(self, doser: Doser, fault: DosingFault | None = None) -> DoseRecord:
+    def dose(self, doser: Doser, fault: DosingFault = NO_FAULT) -> DoseRecord:
         """Run one dose into the empty receiver on the balance."""
         rng, scale = self._rng, self.scale
-        dt = TIME_STEP
-        missing = fault is not None and fault.kind == "receiver missing"
-        base = 0.0 if missing else self.receiver_mass
+        base = 0.0 if fault.kind == "receiver missing" else self.receiver_mass
         cell, shown = _Filter(scale, base), self._display(base, zero=self.tare)
         drops = int(rng.integers(0, 4))
-        tilt = target = speed = 0.0
-        ordered, fresh, pending = TiltCommand(0.0), 0.0, deque[tuple[float, TiltCommand]]()
-        pending_readings: deque[DoseReading] = deque()
+        arm = _TiltingArm(self._network, self._servo_lag)
+        underway, delivered = deque[DoseReading](), list[DoseReading]()
         next_call, next_reading = 0.0, float(rng.uniform(0.0, scale.interval))
         finished_at, upright = math.inf, 0.0
         signals: list[tuple[float, float, float, float]] = []
-        delivered: list[DoseReading] = []
-        normals = rng.standard_normal(int(LONGEST_DOSE / dt) * 2 + 20).tolist()
+        normals = rng.standard_normal(int(LONGEST_DOSE / TIME_STEP) * 2 + 20).tolist()
         pour: PouredLiquid = LivePour(self, drops, normals) if self._poured is None else self._poured(self)
-        limit, acceleration = math.radians(90.0), math.radians(600.0)
         k, time = 0, 0.0
         while time < LONGEST_DOSE and time < finished_at + 2.5:
             # ---- controller and arm
-            silent = fault is not None and fault.kind in ("stall", "killed") and time > pour.first_flow + fault.at
-            if silent and fault is not None and fault.kind == "stall":
-                silent = time < pour.first_flow + fault.at + 0.7
-            if time >= next_call - 1e-9 and finished_at == math.inf and not silent:
+            due = time >= next_call - 1e-9 and finished_at == math.inf
+            if due and not fault.silences(time, pour.first_flow):
                 next_call = time + self._interval
                 arrived = []
-                while pending_readings and pending_readings[0].time <= time:
-                    arrived.append(pending_readings.popleft())
+                while underway and underway[0].time <= time:
+                    arrived.append(underway.popleft())
                 delivered += arrived
-                command = doser.step(time, tilt, arrived)
+                command = doser.step(time, arm.tilt, arrived)
                 if command is not None:
-                    pending.append((time + self._network, command))
+                    arm.order(time, command)
                     if command.finished:
                         finished_at = time
-            while pending and pending[0][0] <= time:
-                _, ordered = pending.popleft()
-                fresh = time
-            lost = time - fresh > min(ordered.patience, NEWS_TIMEOUT)
-            if lost and fault is not None and fault.kind == "killed" and tilt < 1e-4 and pour.first_flow < math.inf:
+            lost = arm.without_news(time)
+            if lost and fault.kind == "killed" and arm.tilt < 1e-4 and pour.first_flow < math.inf:
                 finished_at = min(finished_at, time)
-            wanted = -math.radians(60.0) if lost or finished_at < math.inf else min(max(ordered.speed, -limit), limit)
-            # v = √(2 a left): the speed from which the arm still stops at the command's largest tilt
-            wanted = min(wanted, math.sqrt(2.0 * acceleration * max(ordered.highest - target, 0.0)))
-            before = speed
-            speed += min(max(wanted - speed, -acceleration * dt), acceleration * dt)
-            target += speed * dt
-            if target < 0.0:
-                target, speed = 0.0, 0.0
-            tilt += (target - tilt) * dt / self._servo_lag  # first-order lag of the servo
-            if tilt > 0.01:
+            turned = arm.step(returns=lost or finished_at < math.inf)
+            if arm.tilt > 0.01:
                 upright = time
-            missed = fault is not None and fault.kind == "miss" and time > pour.first_flow + fault.at
-            load = base + pour.step(tilt, speed - before, missed=missed)
+            load = base + pour.step(arm.tilt, turned, missed=fault.acts("miss", time, pour.first_flow))
             # ---- balance
-            if fault is not None:
-                after = time - pour.first_flow - fault.at
-                if fault.kind == "knock" and 0.0 <= after < 0.2:
-                    load += 5e-3
-                if fault.kind == "unstable":
-                    load += 2e-3 * math.sin(8.0 * time) + 1e-3 * normals[2 * k + 1]
+            load += fault.load(time, pour.first_flow, normals[2 * k + 1])
             shown.advance(cell.step(load))
             if time >= next_reading:
                 next_reading += scale.interval + 0.005 * normals[2 * k + 1] * scale.interval / 0.1
-                if not (fault is not None and fault.kind == "line cut" and time > pour.first_flow + fault.at):
-                    pending_readings += shown.readings(time + scale.delay)
+                if not fault.acts("line cut", time, pour.first_flow):
+                    underway += shown.readings(time + scale.delay)
             if k % 4 == 0:
-                signals.append((time, tilt, pour.received, pour.flow))
+                signals.append((time, arm.tilt, pour.received, pour.flow))
             k += 1
-            time = k * dt
-        columns = np.array(signals).T
+            time = k * TIME_STEP
+        times, tilts, true_mass, flow = np.array(signals).T
         return DoseRecord(
-            pour.at_rest(),
-            pour.spilled,
-            min(finished_at, LONGEST_DOSE),
-            0.0 if pour.last_flow == math.inf else pour.last_flow,
-            upright,
-            columns[0],
-            columns[1],
-            columns[2],
-            columns[3],
-            tuple(delivered),
+            received=pour.at_rest(),
+            spilled=pour.spilled,
+            duration=min(finished_at, LONGEST_DOSE),
+            stopped=0.0 if pour.last_flow == math.inf else pour.last_flow,
+            upright=upright,
+            times=times,
+            tilts=tilts,
+            true_mass=true_mass,
+            flow=flow,
+            readings=tuple(delivered),
         )
 
     @property
@@ -459,6 +497,49 @@ class VirtualDosingBench:
         """Liquid that follows a tilt from elsewhere, such as that of an emulated arm."""
         drops = int(self._rng.integers(0, 4))
         return LivePour(self, drops, self._rng.standard_normal(int(LONGEST_DOSE / TIME_STEP) * 2 + 20).tolist())
+
+
+class _TiltingArm:
+    """Follows commands that arrive late; without news it turns back.
+
+    Args:
+        network: time until a command arrives [s].
+        servo_lag: of the tilt behind its target [s].
+
+    Attributes:
+        tilt: [rad].
+    """
+
+    def __init__(self, network: float, servo_lag: float) -> None:
+        self._network, self._servo_lag = network, servo_lag
+        self._underway: deque[tuple[float, TiltCommand]] = deque()
+        self._command, self._arrived_at = TiltCommand(0.0), 0.0
+        self._target = self._speed = 0.0
+        self.tilt = 0.0
+
+    def order(self, time: float, command: TiltCommand) -> None:
+        """Send a command at a time [s]."""
+        self._underway.append((time + self._network, command))
+
+    def without_news(self, time: float) -> bool:
+        """Receive what has arrived until a time [s]. Returns whether the last command is too old to be followed."""
+        while self._underway and self._underway[0][0] <= time:
+            _, self._command = self._underway.popleft()
+            self._arrived_at = time
+        return time - self._arrived_at > min(self._command.patience, NEWS_TIMEOUT)
+
+    def step(self, *, returns: bool) -> float:
+        """Move for one step of `TIME_STEP`, back or as commanded. Returns the change of the target's speed [rad/s]."""
+        wanted = -RETURN_SPEED if returns else min(max(self._command.speed, -SPEED_LIMIT), SPEED_LIMIT)
+        # v = √(2 a left): the speed from which the arm still stops at the command's largest tilt
+        wanted = min(wanted, math.sqrt(2.0 * ACCELERATION * max(self._command.highest - self._target, 0.0)))
+        before, most = self._speed, ACCELERATION * TIME_STEP
+        self._speed += min(max(wanted - before, -most), most)
+        self._target += self._speed * TIME_STEP
+        if self._target < 0.0:
+            self._target = self._speed = 0.0
+        self.tilt += (self._target - self.tilt) * TIME_STEP / self._servo_lag  # first-order lag of the servo
+        return self._speed - before
 
 
 class LivePour:
@@ -499,15 +580,15 @@ class LivePour:
         noise, kick = self._normals[2 * k % len(self._normals)], self._normals[(2 * k + 1) % len(self._normals)]
         density, nu, tension = liquid.density, liquid.kinematic_viscosity, liquid.surface_tension
         spouted = cup.spout_length > 0.0
-        critical, clinging = (1.0, 0.25) if spouted else (3.0, 0.08)
-        film_share, film_time = (0.07, 0.7) if liquid.is_thick else (0.03, 0.25)
-        omega = math.sqrt(1.841 * GRAVITY / cup.radius)
+        lip = SPOUT if spouted else ROUND_RIM
+        film = THICK_FILM if liquid.is_thick else THIN_FILM
+        omega = math.sqrt(SLOSH_MODE * GRAVITY / cup.radius)
         # ---- cup
         # First slosh mode of a deep cup: η'' + 0.08 ω η' + ω² η = −forcing by the tilt's acceleration; ω² = 1.841 g/R
         self._slosh_speed -= dt * (
             omega**2 * self._slosh
-            + 0.08 * omega * self._slosh_speed
-            + 0.5 * omega**2 * cup.radius * 0.08 * turned / dt / GRAVITY
+            + SLOSH_DAMPING * omega * self._slosh_speed
+            + 0.5 * omega**2 * cup.radius * SLOSH_LEVER * turned / dt / GRAVITY
         )
         self._slosh += dt * self._slosh_speed
         head = bench.head(tilt, self._slosh)
@@ -529,7 +610,8 @@ class LivePour:
             # We = ρ U² e / σ of the film e; below 1.5 times the critical number a part clings to the outside
             thickness = max(0.6 * head, 1e-5)
             weber = density * (outflow / (wide * thickness)) ** 2 * thickness / tension
-            clings = clinging * min(max((1.5 * critical - weber) / critical, 0.0), 1.0)
+            critical = lip.critical_weber
+            clings = lip.clinging * min(max((1.5 * critical - weber) / critical, 0.0), 1.0)
             bench.wet(True)
             self.first_flow = min(self.first_flow, time)
         else:
@@ -537,15 +619,14 @@ class LivePour:
             bench.wet(False)
         bench.volume -= outflow * dt
         mass = density * outflow * dt
-        # Half of what clings drips into the receiver with the time constant 0.8 s, half is spilled; the film drains
-        # with `film_time`.
+        # Half of what clings drips into the receiver with the time constant 0.8 s, half is spilled.
         clinging_mass = clings * mass
         self._late += 0.5 * clinging_mass - self._late * dt / 0.8
         self.spilled += 0.5 * clinging_mass
-        self._film += film_share * mass
-        drained = self._film * dt / film_time
+        self._film += film.share * mass
+        drained = self._film * dt / film.time
         self._film -= drained
-        leaves = (1.0 - film_share) * mass - clinging_mass + drained + self._late * dt / 0.8
+        leaves = (1.0 - film.share) * mass - clinging_mass + drained + self._late * dt / 0.8
         if mass == 0.0 and self.first_flow < math.inf and time > self.first_flow + 1.0 and self._drops and kick > 2.9:
             self._drops -= 1
             drop = min(5e-5, bench.volume * density)
@@ -554,7 +635,7 @@ class LivePour:
         if mass > 0.0:
             self.last_flow = time
         # ---- stream
-        height = bench.fall_height - self.received / (density * math.pi * 0.035**2)
+        height = bench.fall_height - self.received / (density * math.pi * RECEIVER_RADIUS**2)
         fall = (math.sqrt(0.01 + 2.0 * GRAVITY * height) - 0.1) / GRAVITY
         # t_f = (√(v² + 2 g H) − v) / g with v = 0.1 m/s at the lip, and landing spread over three steps
         place = k + int(fall / dt) + (k % 3)

@@ -24,7 +24,7 @@ from actors.dosing.dose_controller import DoseOrder
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.tilt_command import TiltCommand
-from actors.dosing.virtual_dosing_bench import DosingFault, TrueCup, TrueScale, VirtualDosingBench
+from actors.dosing.virtual_dosing_bench import NO_FAULT, DosingFault, TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
 from orchestrator.recordings.recording_file import PourRecording, load_recording, write_recording
 from sim_engine.errors import InvalidArgumentError
@@ -175,7 +175,7 @@ def practice_day(folder: Path, seed: int, wrong: str | None = None, sign: int = 
         placed = bench.place_receiver()
         scene = Scene(step.name, pourer, receiver, assumed.model_copy(update={"mass": step.fill}))
         if step.amount is None:
-            record = bench.dose(_PlannedTilt(step), DosingFault("miss", 0.0) if step.misses else None)
+            record = bench.dose(_PlannedTilt(step), DosingFault("miss", 0.0) if step.misses else NO_FAULT)
         else:
             series = DoseSeries(
                 flow_of(scene), DosingSettings(), SourceContent(step.fill), placed, rng, particles=60, step=scale.step

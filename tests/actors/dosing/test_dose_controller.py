@@ -27,6 +27,7 @@ from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading,
 from actors.dosing.dose_series import DoseSeries, SourceContent, after_dose
 from actors.dosing.tilt_command import TiltCommand
 from actors.dosing.virtual_dosing_bench import (
+    NO_FAULT,
     DoseRecord,
     DosingFault,
     LivePour,
@@ -117,7 +118,7 @@ def test_the_step_of_the_receiver_shows_the_lag(kind: str, lag: float) -> None:
 
 def one_dose(
     amount: float = 0.05,
-    fault: DosingFault | None = None,
+    fault: DosingFault = NO_FAULT,
     *,
     seed: int = 1,
     mass: float = 0.3,
