@@ -12,6 +12,7 @@ import contextlib
 import math
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -156,8 +157,131 @@ class _Ended:
 _Move = Callable[[list[float], list[FloatArray]], _Ended | None]
 
 
-# More than 25 methods: the whole arm interface.
-class JointArm:
+# The members of the whole arm interface that are the same for a UR's motion programs and for joint trajectories.
+class JointMotions(ABC):
+    """Which motions an arm with joints makes, with whose consent: what all drivers share.
+
+    Args:
+        spec: settings of the arm.
+    """
+
+    def __init__(self, spec: JointArmSettings) -> None:
+        self._spec = spec
+        self._working = threading.Lock()
+        self._released_at: float | None = None
+        self._last_pour: PourPath | None = None
+
+    # ---- what a driver adds
+
+    @abstractmethod
+    def joints(self) -> tuple[float, ...]:
+        """Measured joints [rad]."""
+
+    @abstractmethod
+    def _measured(self) -> FloatArray:
+        """The same, of an arm that this thread is at work with, shape (n,)."""
+
+    @abstractmethod
+    def _go(self, segment: MotionSegment) -> ExecutedPath:
+        """Execute one motion to its end, with consent."""
+
+    @abstractmethod
+    def _fail(self) -> None:
+        """Lock the arm after an error, and show it as stopped."""
+
+    def _check_plan(self, path: PourPath | PlaceWay) -> None:  # noqa: B027
+        """Refuse a path that was planned for another robot."""
+
+    # ---- motions
+
+    def where(self) -> ArmPose:
+        """See `Arm.where`."""
+        from scipy.spatial.transform import Rotation
+
+        joints = self.joints()
+        rotation, position = self._spec.kinematics.forward(np.array(joints))
+        tool = cell_transforms(self._spec).tool
+        x, y, z = map(float, position + rotation @ tool.position)
+        rx, ry, rz = map(float, Rotation.from_matrix(rotation @ tool.rotation).as_rotvec())
+        return ArmPose(Pose.of(x, y, z, rx, ry, rz), joints, self._spec.home_joints)
+
+    def pace(self, time_scale: float) -> None:
+        """Set the bench seconds per second of the clock, of a virtual bench."""
+        self._spec = self._spec.with_values(time_scale=time_scale)
+
+    def release(self, warned: bool = False) -> None:
+        """See `Arm.release`; `warned`: the next motion begins at once."""
+        self._released_at = time.monotonic() - (self._spec.warning_time if warned else 0.0)
+
+    def move_to_start(self, path: PourPath) -> None:
+        """See `Arm.move_to_start`."""
+        with self._at_work("moving"):
+            self._check_plan(path)
+            self._go(MotionSegment.of("approach", path.approach, self._spec))
+
+    def execute(self, path: PourPath) -> ExecutedPath:
+        """See `Arm.execute`."""
+        with self._at_work("pouring"):
+            self._check_plan(path)
+            self._last_pour = path
+            return self._go(MotionSegment.of_pour(path))
+
+    def retreat(self, path: PourPath | PlaceWay) -> None:
+        """See `Arm.retreat`."""
+        with self._at_work("retreating"):
+            self._consent()
+            self._go(MotionSegment.of("retreat", way_home(path, self._measured(), self._spec), self._spec))
+            self._released_at = None
+
+    def carry(self, way: PlaceWay) -> None:
+        """See `CarryingArm.carry`."""
+        with self._at_work("carrying"):
+            self._check_plan(way)
+            self._go(MotionSegment.of("carry", way.retreat if way.homewards else way.approach, self._spec))
+
+    def untilt(self, path: PourPath | None = None) -> None:
+        """See `Arm.untilt`."""
+        with self._at_work("un-tilting"):
+            self._consent()
+            poured = path or self._last_pour
+            if poured is None:
+                raise ArmRefusedError("no pour is known that was stopped; bring the pourer upright at the robot")
+            self._last_pour = poured
+            way, tilts = upright_way(poured, self._measured(), self._spec)
+            self._go(MotionSegment(way, (("untilt", 0.0, way.duration),), tilts))
+            self._released_at = None
+
+    def jog(self, axis: str, amount: float, speed: float) -> None:
+        """See `Arm.jog`; at most 10° or 50 mm."""
+        with self._at_work("jogging"):
+            self._consent()
+            way = jog_path(self._spec, self._measured().tolist(), axis, amount, speed)
+            self._go(MotionSegment.of("jog", way, self._spec))
+            self._released_at = None
+
+    # ---- implementation
+
+    @contextlib.contextmanager
+    def _at_work(self, doing: str) -> Iterator[None]:
+        if not self._working.acquire(timeout=0.5):
+            raise ArmRefusedError(f"the arm is busy; {doing} has to wait")
+        try:
+            yield
+        except ArmNotReleasedError:
+            raise
+        except LaboratoryError:
+            self._fail()
+            raise
+        finally:
+            self._working.release()
+
+    def _consent(self) -> float:
+        if self._released_at is None:
+            raise ArmNotReleasedError("the arm is locked: an operator has to release it before it moves")
+        return self._released_at
+
+
+class JointArm(JointMotions):
     """The driver of an arm with joints; see `actors.arm.arm_interface.Arm`.
 
     Args:
@@ -166,15 +290,13 @@ class JointArm:
     """
 
     def __init__(self, spec: JointArmSettings, robot: Callable[[Any], JointRobot | VelocityRobot]) -> None:
-        self._spec, self.robot = spec, robot(spec)
-        self._working = threading.Lock()
-        self._released_at: float | None = None
+        super().__init__(spec)
+        self.robot = robot(spec)
         self._stops = self._stops_before = 0
         self._asked = threading.Condition()
         self._facts: ArmFacts | None = None
         self._clock = device_clock(spec.clock)
         self._state = ArmState()
-        self._last_pour: PourPath | None = None
 
     # ---- nothing moves
 
@@ -201,8 +323,8 @@ class JointArm:
             self._read()
 
     def release(self, warned: bool = False) -> None:
-        """See `Arm.release`; `warned`: the next motion begins at once."""
-        self._released_at = time.monotonic() - (self._spec.warning_time if warned else 0.0)
+        """See `Arm.release`."""
+        super().release(warned)
         self._state = replace(self._state, stopped=False)
 
     def recover(self) -> str:
@@ -217,70 +339,14 @@ class JointArm:
             self._state = replace(self._state, stopped=True)
             return done
 
-    def pace(self, time_scale: float) -> None:
-        """Set the bench seconds per second of the clock, of a virtual bench."""
-        self._spec = self._spec.with_values(time_scale=time_scale)
-
     def state(self) -> ArmState:
         """See `Arm.state`."""
         return self._state
 
-    def where(self) -> ArmPose:
-        """See `Arm.where`."""
-        from scipy.spatial.transform import Rotation
-
+    def joints(self) -> tuple[float, ...]:
+        """See `JointMotions.joints`."""
         with self._at_work("asking where it is"):
-            joints = self._read().joints
-        rotation, position = self._spec.kinematics.forward(joints)
-        tool = cell_transforms(self._spec).tool
-        x, y, z = map(float, position + rotation @ tool.position)
-        rx, ry, rz = map(float, Rotation.from_matrix(rotation @ tool.rotation).as_rotvec())
-        return ArmPose(Pose.of(x, y, z, rx, ry, rz), tuple(joints.tolist()), self._spec.home_joints)
-
-    # ---- motions
-
-    def move_to_start(self, path: PourPath) -> None:
-        """See `Arm.move_to_start`."""
-        with self._at_work("moving"):
-            self._go(MotionSegment.of("approach", path.approach, self._spec))
-
-    def execute(self, path: PourPath) -> ExecutedPath:
-        """See `Arm.execute`."""
-        with self._at_work("pouring"):
-            self._last_pour = path
-            return self._go(MotionSegment.of_pour(path))
-
-    def retreat(self, path: PourPath | PlaceWay) -> None:
-        """See `Arm.retreat`."""
-        with self._at_work("retreating"):
-            self._consent()
-            self._go(MotionSegment.of("retreat", way_home(path, self._read().joints, self._spec), self._spec))
-            self._released_at = None
-
-    def carry(self, way: PlaceWay) -> None:
-        """See `CarryingArm.carry`."""
-        with self._at_work("carrying"):
-            self._go(MotionSegment.of("carry", way.retreat if way.homewards else way.approach, self._spec))
-
-    def untilt(self, path: PourPath | None = None) -> None:
-        """See `Arm.untilt`."""
-        with self._at_work("un-tilting"):
-            self._consent()
-            poured = path or self._last_pour
-            if poured is None:
-                raise ArmRefusedError("no pour is known that was stopped; bring the pourer upright at the robot")
-            self._last_pour = poured
-            way, tilts = upright_way(poured, self._read().joints, self._spec)
-            self._go(MotionSegment(way, (("untilt", 0.0, way.duration),), tilts))
-            self._released_at = None
-
-    def jog(self, axis: str, amount: float, speed: float) -> None:
-        """See `Arm.jog`; at most 10° or 50 mm."""
-        with self._at_work("jogging"):
-            self._consent()
-            way = jog_path(self._spec, self._read().joints.tolist(), axis, amount, speed)
-            self._go(MotionSegment.of("jog", way, self._spec))
-            self._released_at = None
+            return tuple(self._measured().tolist())
 
     # ---- the end
 
@@ -328,29 +394,18 @@ class JointArm:
 
     @contextlib.contextmanager
     def _at_work(self, doing: str) -> Iterator[None]:
-        if not self._working.acquire(timeout=0.2):
-            raise ArmRefusedError(f"the arm is busy; {doing} has to wait")
-        try:
-            yield
-        except ArmNotReleasedError:
-            raise
-        except ConnectionError as error:
-            self._lock()
-            raise ArmLostError(f"{error}. {self._after_loss}; look at it") from error
-        except LaboratoryError:
-            self._lock()
-            raise
-        finally:
-            self._working.release()
+        with super()._at_work(doing):
+            try:
+                yield
+            except ConnectionError as error:
+                raise ArmLostError(f"{error}. {self._after_loss}; look at it") from error
 
-    def _lock(self) -> None:
+    def _fail(self) -> None:
         self._released_at = None
         self._state = replace(self._state, moving=False, stopped=True)
 
-    def _consent(self) -> float:
-        if self._released_at is None:
-            raise ArmNotReleasedError("the arm is locked: an operator has to release it before it moves")
-        return self._released_at
+    def _measured(self) -> FloatArray:
+        return self._read().joints
 
     def _read(self) -> JointReading:
         reading = self.robot.read()
@@ -401,7 +456,7 @@ class JointArm:
         executed = self._executed(times, joints, ended is None)
         if ended is None:
             return executed
-        self._lock()
+        self._fail()
         if move is None:
             raise segment.stopped(ended, executed)
         raise ArmStoppedError(f"dose: {ended.text}", ended.kind, "dose", ended.clock, self._state.tilt, executed)
@@ -444,7 +499,7 @@ class JointArm:
         self._begin(path)
         for reading in self._readings(times, joints):
             now, clock = reading.time, min(reading.time, path.duration)
-            self._show(reading, time=clock, fraction=clock / path.duration, phase=segment.phase(min(clock, now)))
+            self._show(reading, time=now, fraction=clock / path.duration, phase=segment.phase(clock))
             held_up = now - before
             before = now
             if not reason[0] and (self._ordered or reading.problem or held_up > self._longest_gap):

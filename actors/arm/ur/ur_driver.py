@@ -11,9 +11,7 @@ import contextlib
 import itertools
 import math
 import os
-import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,21 +19,18 @@ import numpy as np
 from actors.arm.arm_interface import (
     ArmError,
     ArmLostError,
-    ArmNotReleasedError,
-    ArmPose,
     ArmRefusedError,
     ArmState,
     ArmStoppedError,
     NotAcceptedError,
 )
+from actors.arm.joint_driver import JointMotions
 from actors.arm.planned_pour import ExecutedPath, FloatArray, PlaceWay, PourPath
-from actors.arm.planning.kinematics import cell_transforms
-from actors.arm.planning.motion_segments import MotionSegment, jog_path, upright_way, way_home
+from actors.arm.planning.motion_segments import MotionSegment
 from actors.arm.planning.path_checks import recheck
 from actors.arm.ur.dashboard import DashboardError, stop_program
 from actors.arm.ur.executed_motion import Stops, StopTimes, executed_dose, executed_path
 from actors.arm.ur.robot_comparison import payload_check
-from actors.arm.ur.ur_kinematics import forward
 from actors.arm.ur.ur_session import ANSWER_TIME, Session, UrFacts
 from actors.arm.ur.urscript_writer import TiltLimits, path_program, tilt_program
 from actors.arm.ur.worker_messages import (
@@ -47,7 +42,7 @@ from actors.arm.ur.worker_messages import (
     TiltOrder,
 )
 from actors.arm.ur_settings import UrArmSettings
-from actors.arm_geometry import Joints, Pose
+from actors.arm_geometry import Joints
 from actors.interfaces import LaboratoryError
 
 RECOVERY_TIME = 90.0
@@ -59,6 +54,9 @@ MOTION_MARGIN = 40.0
 IN_REDUCED_MODE = 0.25
 """Fraction of the speed of a motion in reduced mode: 100 mm/s at most, and below the speeds that installations limit
 it to."""
+
+RETURNS = ("retreat", "untilt")
+"""Motions that carry and pour nothing: they are allowed in reduced mode, where they are slowed."""
 
 STOP_TIME = 1.0
 """Time for each means of stopping before the next one is tried [s]."""
@@ -95,7 +93,7 @@ _numbers = itertools.count(os.getpid() % 4096 * 65536 + 1)
 
 
 # More than 25 methods: the whole arm interface, and what each of its motions checks before and after.
-class UrArm:
+class UrArm(JointMotions):
     """A UR arm.
 
     Args:
@@ -106,17 +104,15 @@ class UrArm:
     """
 
     def __init__(self, spec: UrArmSettings) -> None:
-        self._spec = spec
+        super().__init__(spec)
+        self._spec: UrArmSettings = spec
         self._session = Session(spec)
-        self._working = threading.Lock()
-        self._released_at: float | None = None
         self._stops = Stops()
         self._stopped = False
         self.last_stop: StopTimes | None = None
         self._segment: MotionSegment | None = None
         self._announced = False
         self._tilting: _Tilts | None = None
-        self._last_pour: PourPath | None = None
         self._tilt = 0.0
 
     # ---- nothing moves
@@ -137,37 +133,22 @@ class UrArm:
             return self._session.find_out()
 
     def joints(self) -> Joints:
-        """Measured joints [rad]; during a motion as last reported, about twenty times a second."""
+        """See `JointMotions.joints`; during a motion as last reported, about twenty times a second."""
         progress = self._session.progress
         if self._segment is not None and progress is not None:
             a, b, c, d, e, f = progress.joints
             return a, b, c, d, e, f
         with self._at_work("asking for joints"):
-            return self._joints()
+            a, b, c, d, e, f = self._measured().tolist()
+            return a, b, c, d, e, f
 
-    def _joints(self) -> Joints:
+    def _measured(self) -> FloatArray:
         reading: DataPackage = self._session.ask("read")
-        a, b, c, d, e, f = reading.joints
-        return a, b, c, d, e, f
-
-    def where(self) -> ArmPose:
-        """See `Arm.where`."""
-        from scipy.spatial.transform import Rotation
-
-        joints = self.joints()
-        rotation, position = forward(np.array([joints]), self._spec.robot)
-        tool = cell_transforms(self._spec).tool
-        x, y, z = map(float, position[0] + rotation[0] @ tool.position)
-        rx, ry, rz = map(float, Rotation.from_matrix(rotation[0] @ tool.rotation).as_rotvec())
-        return ArmPose(Pose.of(x, y, z, rx, ry, rz), joints, self._spec.home.angles)
-
-    def pace(self, time_scale: float) -> None:
-        """Set the controller seconds per second of the clock, of a virtual bench."""
-        self._spec = self._spec.with_values(time_scale=time_scale)
+        return np.array(reading.joints)
 
     def release(self, warned: bool = False) -> None:
-        """See `Arm.release`; `warned`: the next motion begins at once."""
-        self._released_at = time.monotonic() - (self._spec.warning_time if warned else 0.0)
+        """See `Arm.release`."""
+        super().release(warned)
         self._stopped = False
 
     def lock(self) -> None:
@@ -203,30 +184,15 @@ class UrArm:
 
     # ---- motions
 
-    def move_to_start(self, path: PourPath) -> None:
-        """See `Arm.move_to_start`."""
-        with self._at_work("moving"):
-            self._check_calibration(path)
-            self._go(MotionSegment.of("approach", path.approach, self._spec), pours=True)
-
-    def execute(self, path: PourPath) -> ExecutedPath:
-        """See `Arm.execute`; the encoders are sampled `spec.rate` times per second of the clock."""
-        with self._at_work("pouring"):
-            self._check_calibration(path)
-            self._last_pour = path
-            executed = self._go(MotionSegment.of_pour(path), pours=True)
-            self._tilt = float(path.tilts[-1])
-            return executed
-
     def dose(self, path: PourPath, longest: float) -> ExecutedPath:
         """See `DosingArm.dose`."""
         with self._at_work("dosing"):
-            self._check_calibration(path)
+            self._check_plan(path)
             self._last_pour = path
             tilts, joints = path.tilt_part
             limits = TiltLimits(path.report.tilt_speed, TILT_ACCELERATION)
             try:
-                return self._go(MotionSegment.of_pour(path), pours=True, tilts=_Tilts(tilts, joints, limits, longest))
+                return self._go(MotionSegment.of_pour(path), _Tilts(tilts, joints, limits, longest))
             finally:
                 self._tilting = None
 
@@ -236,41 +202,6 @@ class UrArm:
             first, last = float(tilting.tilts[0]), float(tilting.tilts[-1])
             self._session.tilt(TiltOrder(speed, min(max(highest, first), last) - first, patience))
         return self.state()
-
-    def retreat(self, path: PourPath | PlaceWay) -> None:
-        """See `Arm.retreat`."""
-        with self._at_work("retreating"):
-            self._consent()
-            way = way_home(path, np.array(self._joints()), self._spec)
-            self._go(MotionSegment.of("retreat", way, self._spec))
-            self.lock()
-
-    def carry(self, way: PlaceWay) -> None:
-        """See `CarryingArm.carry`."""
-        with self._at_work("carrying"):
-            self._check_calibration(way)
-            self._go(MotionSegment.of("carry", way.retreat if way.homewards else way.approach, self._spec), pours=True)
-
-    def untilt(self, path: PourPath | None = None) -> None:
-        """See `Arm.untilt`."""
-        with self._at_work("un-tilting"):
-            self._consent()
-            poured = path or self._last_pour
-            if poured is None:
-                raise ArmRefusedError("no pour is known that was stopped; bring the pourer upright at the pendant")
-            self._last_pour = poured
-            way, tilts = upright_way(poured, np.array(self._joints()), self._spec)
-            self._go(MotionSegment(way, (("untilt", 0.0, way.duration),), tilts))
-            self._tilt = float(tilts[-1])
-            self.lock()
-
-    def jog(self, axis: str, amount: float, speed: float) -> None:
-        """See `Arm.jog`; at most 10° or 50 mm."""
-        with self._at_work("jogging"):
-            self._consent()
-            way = jog_path(self._spec, self._joints(), axis, amount, speed)
-            self._go(MotionSegment.of("jog", way, self._spec), pours=True)
-            self.lock()
 
     def recover(self) -> str:
         """See `Arm.recover`; unlocks, switches on and reconnects."""
@@ -332,28 +263,11 @@ class UrArm:
 
     # ---- implementation
 
-    @contextlib.contextmanager
-    def _at_work(self, doing: str) -> Iterator[None]:
-        if not self._working.acquire(timeout=0.5):
-            raise ArmRefusedError(f"the arm is busy; {doing} has to wait")
-        try:
-            yield
-        except ArmNotReleasedError:
-            raise
-        except LaboratoryError:
-            self.lock()
-            self._stopped = True
-            raise
-        finally:
-            self._working.release()
+    def _fail(self) -> None:
+        self.lock()
+        self._stopped = True
 
-    def _consent(self) -> float:
-        released = self._released_at
-        if released is None:
-            raise ArmNotReleasedError("the arm is locked: an operator has to release it before it moves")
-        return released
-
-    def _check_calibration(self, path: PourPath | PlaceWay) -> None:
+    def _check_plan(self, path: PourPath | PlaceWay) -> None:
         checksum = self._spec.robot.parameters.checksum
         if path.calibration not in (None, checksum):
             raise ArmRefusedError(
@@ -362,16 +276,16 @@ class UrArm:
                 "facts (`ArmSettings.fitted_to`)"
             )
 
-    def _go(self, segment: MotionSegment, *, pours: bool = False, tilts: _Tilts | None = None) -> ExecutedPath:
+    def _go(self, segment: MotionSegment, tilts: _Tilts | None = None) -> ExecutedPath:
         """Execute one motion to its end.
 
         Args:
             segment: the motion.
             tilts: of a dose, which goes to and fro on the tilt of the segment.
-            pours: it may carry or pour liquid. Other motions are allowed in reduced mode, where they are slowed.
         """
         stops = self._stops.count  # before consent is checked, so that a stop in between counts
         released, spec = self._consent(), self._spec
+        pours = segment.name not in RETURNS
         if not pours and self._session.ask("read").safety_mode == REDUCED:
             segment = segment.slowed(IN_REDUCED_MODE)
         path = segment.path
@@ -462,6 +376,7 @@ class UrArm:
             forces=outcome.forces,
         )
         if completed:
+            self._tilt = float(segment.tilts[-1])
             return executed
         self._tilt, self._stopped = segment.tilt_left(outcome), True
         if outcome.kind == "lost":
