@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from actors.runtime.bench_clock import SharedClock
 from decant.plugins.testing import GripperContract, GripperRig
 from orchestrator.campaigns.file_loading import load_laboratory
 from sim_engine.errors import DecantError
@@ -100,6 +101,17 @@ def test_fingers_that_were_not_homed_are_made_ready_first(bench: GripperRig, emu
     assert "not homed" in bench.driver.state().problem
     bench.driver.prepare()
     assert bench.driver.state().problem == ""
+
+
+def test_a_hand_of_a_busy_virtual_bench_is_read_again(emulator: HandEmulator, tmp_path: Path) -> None:
+    """One late state let a pour end as if its cup were lost."""
+    SharedClock.create(tmp_path / "clock")
+    driver: Any = FrankaHand(emulator.gripper.with_values(clock=str(tmp_path / "clock")))
+    driver.connect()
+    threading.Timer(1.5, emulator.fault, ("power", 1.0)).start()  # libfranka waits for a state for a second
+    emulator.fault("power", 0.0)
+    assert driver.state().problem == ""
+    driver.close()
 
 
 def test_nobody_at_the_address_is_one_error() -> None:
