@@ -231,21 +231,41 @@ def read_status(host: str) -> Findings:
     Args:
         host: address or name of the controller.
     """
+    return _read(host, whole=False)
+
+
+def look_at(host: str) -> Findings:
+    """Read everything from the controller.
+
+    Args:
+        host: its address or name.
+    """
+    return _read(host, whole=True)
+
+
+def _read(host: str, *, whole: bool) -> Findings:
     try:
         address = _resolved(host)
     except OSError as error:
         return Findings("", problems=(str(error),))
     control = _control_port(address)
-    ports = {port: port_problem(address, port) for port in (control, RTDE)}
-    dashboard = exchange = None
+    further = (primary.PORT, SCRIPTS) if whole else ()
+    ports = {port: port_problem(address, port) for port in (control, *further, RTDE)}
+    dashboard = parts = exchange = None
     problems: list[str] = []
     if ports[control] is None:
         with _noting(problems):
             dashboard = ask_dashboard(address)
+    if whole and ports[primary.PORT] is None:
+        with _noting(problems):
+            parts = primary.read_parts(address)
     if ports[RTDE] is None:
         with _noting(problems):
-            exchange = read_exchange(address, rate=10.0, seconds=0.0)
-    return Findings(address, ports, dashboard, None, exchange, tuple(problems))
+            exchange = read_exchange(address) if whole else read_exchange(address, rate=10.0, seconds=0.0)
+            # a gap may be caused by this computer, so measure twice and keep the better result
+            if whole and exchange.gap > PATIENT_GAP:
+                exchange = min(exchange, read_exchange(address), key=lambda e: e.gap)
+    return Findings(address, ports, dashboard, parts, exchange, tuple(problems))
 
 
 def _control_port(address: str) -> int:
@@ -259,35 +279,6 @@ def _resolved(host: str) -> str:
     address = socket.getaddrinfo(host, None, socket.AF_INET)[0][4][0]
     assert isinstance(address, str)
     return address
-
-
-def look_at(host: str) -> Findings:
-    """Read everything from the controller.
-
-    Args:
-        host: its address or name.
-    """
-    try:
-        address = _resolved(host)
-    except OSError as error:
-        return Findings("", problems=(str(error),))
-    control = _control_port(address)
-    ports = {port: port_problem(address, port) for port in (control, primary.PORT, SCRIPTS, RTDE)}
-    dashboard = parts = exchange = None
-    problems: list[str] = []
-    if ports[control] is None:
-        with _noting(problems):
-            dashboard = ask_dashboard(address)
-    if ports[primary.PORT] is None:
-        with _noting(problems):
-            parts = primary.read_parts(address)
-    if ports[RTDE] is None:
-        with _noting(problems):
-            exchange = read_exchange(address)
-            # a gap may be caused by this computer, so measure twice and keep the better result
-            if exchange.gap > PATIENT_GAP:
-                exchange = min(exchange, read_exchange(address), key=lambda e: e.gap)
-    return Findings(address, ports, dashboard, parts, exchange, tuple(problems))
 
 
 def recorded_findings(findings: Findings) -> dict[str, Any]:
