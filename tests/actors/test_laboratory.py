@@ -50,25 +50,18 @@ def test_an_arm_of_hardware_is_not_opened_without_a_person_to_ask():
 
 
 @pytest.mark.realtime
-def test_no_bench_is_made_where_none_is_needed(fake, bench_spec, task):
-    async def play():
-        async with laboratory(True, fake, bench=bench_spec) as opened:
-            assert opened.bench is None
-            return (await opened.simulators.simulate(task(seed=4))).outcome.seed
-
-    assert asyncio.run(play()) == 4
+async def test_no_bench_is_made_where_none_is_needed(fake, bench_spec, task):
+    async with laboratory(True, fake, bench=bench_spec) as opened:
+        assert opened.bench is None
+        assert (await opened.simulators.simulate(task(seed=4))).outcome.seed == 4
 
 
 @pytest.mark.realtime
-def test_a_question_that_makes_no_sense_is_an_error_that_says_so(fake):
-    async def play():
-        async with laboratory(True, fake) as opened:
-            await opened.optimizer.suggest(
-                MinimumQuery(space=PROBLEM.space, data=Data(((0.5, 0.5), (float("nan"), 0.1)), (1.0, 2.0)))
-            )
-
-    with pytest.raises(LaboratoryError, match="the optimiser can't answer"):
-        asyncio.run(play())
+async def test_a_question_that_makes_no_sense_is_an_error_that_says_so(fake):
+    question = MinimumQuery(space=PROBLEM.space, data=Data(((0.5, 0.5), (float("nan"), 0.1)), (1.0, 2.0)))
+    async with laboratory(True, fake) as opened:
+        with pytest.raises(LaboratoryError, match="the optimiser can't answer"):
+            await opened.optimizer.suggest(question)
 
 
 @pytest.mark.realtime
@@ -120,7 +113,7 @@ def test_an_engine_without_its_shared_libraries_is_refused_before_anything_start
         check_laboratory(LaboratorySettings(name="planning"), pours=False, plain_processes=True)
 
 
-def test_a_moments_work_needs_no_ray_and_still_simulates_side_by_side(monkeypatch, fake, task):
+async def test_a_moments_work_needs_no_ray_and_still_simulates_side_by_side(monkeypatch, fake, task):
     """`decant plan`: a person waits, and nothing is poured."""
     monkeypatch.setattr("actors.laboratory.installed", lambda name: name != "ray")
     spec = LaboratorySettings(name="planning", simulators=2)
@@ -128,10 +121,8 @@ def test_a_moments_work_needs_no_ray_and_still_simulates_side_by_side(monkeypatc
     with pytest.raises(LaboratoryError, match="Ray, which is not installed"):
         check_laboratory(spec, pours=False)
 
-    async def play():
-        async with open_laboratory(spec, pours=False, plain_processes=True, make=fake()) as laboratory:
-            pool = laboratory.simulators
-            results = await asyncio.gather(*(pool.simulate(task(seed=s)) for s in range(4)))
-            return pool.size, pool.separate, [result.outcome.seed for result in results]
-
-    assert asyncio.run(play()) == (2, True, [0, 1, 2, 3])
+    async with open_laboratory(spec, pours=False, plain_processes=True, make=fake()) as laboratory:
+        pool = laboratory.simulators
+        results = await asyncio.gather(*(pool.simulate(task(seed=s)) for s in range(4)))
+        assert (pool.size, pool.separate) == (2, True)
+        assert [result.outcome.seed for result in results] == [0, 1, 2, 3]

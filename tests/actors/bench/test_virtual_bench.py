@@ -50,14 +50,12 @@ async def test_same_seed_and_action_measure_the_same_bits_whatever_was_poured_be
 
 
 @pytest.mark.realtime
-def test_measured_masses_are_those_of_the_hidden_liquid_within_the_balance(open_bench, scene, action, fake, bench_spec):
+async def test_measured_masses_are_those_of_the_hidden_liquid_within_the_balance(
+    open_bench, scene, action, fake, bench_spec
+):
     """The fake liquid retains exactly a tenth, and spills what its seed says."""
-
-    async def play():
-        async with open_bench() as laboratory:
-            return [await laboratory.bench.pour(scene, action, seed=seed) for seed in range(40)]
-
-    measured = asyncio.run(play())
+    async with open_bench() as laboratory:
+        measured = [await laboratory.bench.pour(scene, action, seed=seed) for seed in range(40)]
     # Two readings, tare and weight: each with the noise and a rounding error.
     deviation = np.sqrt(2 * (bench_spec.balance.noise**2 + bench_spec.balance.resolution**2 / 12))
     assert statistics.mean(m.loaded for m in measured) == pytest.approx(0.2, abs=4 * deviation / np.sqrt(40) + 1e-5)
@@ -101,56 +99,46 @@ async def test_checkpoints_come_in_order_and_the_bar_never_runs_backwards(open_b
 
 
 @pytest.mark.realtime
-def test_a_watcher_that_fails_does_not_disturb_the_pour(open_bench, scene, action):
+async def test_a_watcher_that_fails_does_not_disturb_the_pour(open_bench, scene, action):
     def watcher(progress):
         raise RuntimeError("the screen is gone")
 
-    async def play():
-        async with open_bench() as laboratory:
-            return await laboratory.bench.pour(scene, action, seed=5, progress=watcher)
-
-    assert asyncio.run(play()).loaded == pytest.approx(0.2, abs=1e-3)
+    async with open_bench() as laboratory:
+        measured = await laboratory.bench.pour(scene, action, seed=5, progress=watcher)
+    assert measured.loaded == pytest.approx(0.2, abs=1e-3)
 
 
 @pytest.mark.realtime
-def test_the_operator_takes_bench_time(open_bench, scene, action):
-    async def play():
-        async with open_bench(time_scale=100.0, operator_time=85.0) as laboratory:
-            started = time.monotonic()
-            await laboratory.bench.pour(scene, action, seed=5)
-            return time.monotonic() - started
-
-    # 85 s of operator and some 30 s of everything else, a hundred times as fast.
-    assert asyncio.run(play()) > 0.85 + 0.1
+async def test_the_operator_takes_bench_time(open_bench, scene, action):
+    async with open_bench(time_scale=100.0, operator_time=85.0) as laboratory:
+        started = time.monotonic()
+        await laboratory.bench.pour(scene, action, seed=5)
+        # 85 s of operator and some 30 s of everything else, a hundred times as fast.
+        assert time.monotonic() - started > 0.85 + 0.1
 
 
 @pytest.mark.realtime
-def test_touching_vessels_are_refused_before_the_operator_has_been_called(open_bench, scene, action):
+async def test_touching_vessels_are_refused_before_the_operator_has_been_called(open_bench, scene, action):
     seen = []
-
-    async def play():
-        async with open_bench() as laboratory:
-            with pytest.raises(InvalidActionError, match="cups touch"):
-                await laboratory.bench.pour(
-                    scene, action.with_values(x_offset=0.05, height=-0.05), seed=1, progress=seen.append
-                )
-            return await laboratory.bench.arm.state()
-
-    state = asyncio.run(play())
+    touching = action.with_values(x_offset=0.05, height=-0.05)
+    async with open_bench() as laboratory:
+        with pytest.raises(InvalidActionError, match="cups touch"):
+            await laboratory.bench.pour(scene, touching, seed=1, progress=seen.append)
+        state = await laboratory.bench.arm.state()
     assert seen == []
     assert state.phase == "idle"
     assert state.time == 0.0
 
 
 @pytest.mark.realtime
-def test_vessels_that_touch_as_they_truly_stand_make_the_pour_fail_and_the_bench_pours_on(open_bench, scene, action):
-    async def play():
-        async with open_bench() as laboratory:
-            with pytest.raises(PourFailedError, match="as they truly stand: cups touch"):
-                await laboratory.bench.pour(replace(scene, name="touching"), action, seed=1)
-            return await laboratory.bench.pour(scene, action, seed=5)
-
-    assert asyncio.run(play()).loaded == pytest.approx(0.2, abs=1e-3)
+async def test_vessels_that_touch_as_they_truly_stand_make_the_pour_fail_and_the_bench_pours_on(
+    open_bench, scene, action
+):
+    async with open_bench() as laboratory:
+        with pytest.raises(PourFailedError, match="as they truly stand: cups touch"):
+            await laboratory.bench.pour(replace(scene, name="touching"), action, seed=1)
+        measured = await laboratory.bench.pour(scene, action, seed=5)
+    assert measured.loaded == pytest.approx(0.2, abs=1e-3)
 
 
 @pytest.mark.realtime

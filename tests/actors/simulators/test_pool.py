@@ -129,20 +129,17 @@ async def test_simulators_end_although_the_bench_can_not_be_closed(fake):
 
 
 @pytest.mark.parametrize("kind", ["processes", pytest.param("ray", marks=pytest.mark.ray)])
-def test_simulators_that_crash_are_lost_with_their_last_messages(request, kind, fake, task):
+async def test_simulators_that_crash_are_lost_with_their_last_messages(request, kind, fake, task):
     """A lack of memory leaves none; else it would be a false cause."""
     if kind == "ray":
         request.getfixturevalue("ray_running")
     make_pool = ray_pool if kind == "ray" else process_pool
 
-    async def play():
-        pool = make_pool(1, make=fake())
-        with pytest.raises(SimulationError, match=r"3 simulators died .*Assertion failure: home != nullptr") as error:
-            await pool.simulate(task(name="aborting"))
-        await pool.close()
-        return str(error.value)
-
-    assert "memory" not in asyncio.run(play())
+    pool = make_pool(1, make=fake())
+    with pytest.raises(SimulationError, match=r"3 simulators died .*Assertion failure: home != nullptr") as error:
+        await pool.simulate(task(name="aborting"))
+    await pool.close()
+    assert "memory" not in str(error.value)
 
 
 @pytest.mark.slow
@@ -166,21 +163,18 @@ def test_a_dead_process_is_replaced_and_what_kills_every_one_is_given_up(fake, t
     assert not any(alive(int(line.split()[1])) for line in lines(log))
 
 
-def test_a_process_that_hangs_holds_nobody_up(fake, task, tmp_path, monkeypatch):
+async def test_a_process_that_hangs_holds_nobody_up(fake, task, tmp_path, monkeypatch):
     log = tmp_path / "log"
     monkeypatch.setattr(pools, "DRAIN_DEADLINE", 0.5)
 
-    async def play():
-        pool = process_pool(1, make=fake(60.0, log))
-        job = asyncio.create_task(pool.simulate(task()))
-        await until(lambda: count(log, "begin") == 1)
-        os.kill(int(lines(log)[-1].split()[1]), signal.SIGSTOP)
-        job.cancel()
-        result = await asyncio.wait_for(pool.simulate(task(name="quick", seed=2)), PATIENCE)
-        await pool.close()
-        return result.outcome.seed
-
-    assert asyncio.run(play()) == 2
+    pool = process_pool(1, make=fake(60.0, log))
+    job = asyncio.create_task(pool.simulate(task()))
+    await until(lambda: count(log, "begin") == 1)
+    os.kill(int(lines(log)[-1].split()[1]), signal.SIGSTOP)
+    job.cancel()
+    result = await asyncio.wait_for(pool.simulate(task(name="quick", seed=2)), PATIENCE)
+    await pool.close()
+    assert result.outcome.seed == 2
 
 
 def test_simulating_processes_end_with_a_killed_owner(fake, task, tmp_path):
@@ -204,16 +198,13 @@ def test_simulating_processes_end_with_a_killed_owner(fake, task, tmp_path):
 
 
 @pytest.mark.realtime
-def test_vessels_that_touch_are_an_invalid_action_and_the_pool_goes_on(make_pool, fake, task):
-    async def play():
-        pool = make_pool(fake())
-        with pytest.raises(InvalidActionError, match=r"enters the receiver by 4\.1 mm"):
-            await pool.simulate(task(name="touching"))
-        result = await pool.simulate(task())
-        await pool.close()
-        return result
-
-    assert asyncio.run(play()).outcome.seed == 1
+async def test_vessels_that_touch_are_an_invalid_action_and_the_pool_goes_on(make_pool, fake, task):
+    pool = make_pool(fake())
+    with pytest.raises(InvalidActionError, match=r"enters the receiver by 4\.1 mm"):
+        await pool.simulate(task(name="touching"))
+    result = await pool.simulate(task())
+    await pool.close()
+    assert result.outcome.seed == 1
 
 
 @pytest.mark.realtime
