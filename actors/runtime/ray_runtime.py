@@ -70,7 +70,12 @@ _PROGRAM = "decant_program"
 _TOKEN = secrets.token_hex(32)
 """Ray refuses users without this token. One per process, since Ray reads it only once."""
 
-_JOIN_SETTINGS = {"RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0"}
+_JOIN_SETTINGS = {
+    "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
+    # Ray would print this for each process that died at its task, also for those that are ended with the run. What was
+    # lost by it, and what is repeated, is reported by the pool.
+    "RAY_DEDUP_LOGS_SKIP_REGEX": "^A worker died or was killed while executing a task",
+}
 
 _PRIVATE_SETTINGS = {
     **_JOIN_SETTINGS,

@@ -394,7 +394,8 @@ def _without_holes(vertices: Floats, faces: Integers, wall: float | None, log: _
     if wall is None:
         raise VesselError(
             f"{log.path.name}: a sheet without thickness (its opening is one edge of {1e3 * lengths.max():.0f} mm); "
-            "say how thick its wall is, for example --wall 3mm, and it is thickened outwards"
+            "say how thick its wall is, for example --wall 3mm, and it is thickened outwards. If it is the outside of "
+            "a vessel, its inside is missing: export both"
         )
     log.notes.append(f"the sheet was thickened outwards by {1e3 * wall:g} mm")
     thick = _thickened(_mesh(vertices, faces), wall)

@@ -17,18 +17,15 @@ from typing import Any
 
 from actors.arm.arm_settings import History
 from actors.arm.ur_settings import UrArmSettings
-from actors.emulators.ur_controller.controller_process import VirtualController, VirtualControllerError
+from actors.emulators.ur_controller.controller_process import REPLY_TIME, VirtualController, VirtualControllerError
 from actors.emulators.ur_controller.robot import MODELS, calibrated
 from actors.interfaces import LaboratoryError
-from actors.runtime.bench_clock import PATIENCE, SharedClock
+from actors.runtime.bench_clock import SharedClock
 from actors.runtime.ray_cleanup import MARK
 from actors.runtime.remote_object import DeviceLostError
 
 PORTS = (29999, 30001, 30002, 30003, 30004, 30011, 30012)
 """Ports of a controller: the same at every address."""
-
-REPLY_TIMEOUT = 5.0 * PATIENCE
-"""Longest wait for a reply of the controller's process [s]."""
 
 ATTEMPTS = 20
 
@@ -75,16 +72,16 @@ class UrEmulator:
         lines = [f"set_gravity([{up}])", f"set_tcp(p[{tool}])", f"set_payload({arm.payload!r}, [{centre}])"]
         program = "\n  ".join(["def install():", *lines]) + "\nend\n"
         before = self._state()["messages"]
-        with socket.create_connection((self._controller.address, SCRIPTS), timeout=REPLY_TIMEOUT) as connection:
+        with socket.create_connection((self._controller.address, SCRIPTS), timeout=REPLY_TIME) as connection:
             connection.sendall(program.encode("ascii"))
-            end = time.monotonic() + REPLY_TIMEOUT
+            end = time.monotonic() + REPLY_TIME
             while (state := self._state())["runtime_state"] != "STOPPED" or state["messages"] == before:
                 if time.monotonic() > end:
                     raise LaboratoryError("the virtual arm does not take its settings over")
                 time.sleep(0.01)
 
     def _state(self) -> dict[str, Any]:
-        return self._controller.fault("state", timeout=REPLY_TIMEOUT)
+        return self._controller.fault("state")
 
     def history(self, since: float) -> History:
         """See `ArmEmulator.history`; ten minutes of it are kept.
@@ -93,7 +90,7 @@ class UrEmulator:
             DeviceLostError: the controller does not reply.
         """
         try:
-            answer = self._controller.fault("samples", since=since, timeout=REPLY_TIMEOUT)
+            answer = self._controller.fault("samples", since=since)
         except VirtualControllerError as error:
             raise DeviceLostError(f"what the virtual arm did is not known: {error}") from error
         samples = struct.iter_unpack("7d", b64decode(answer["samples"]))
@@ -103,7 +100,7 @@ class UrEmulator:
     def fault(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """See `ArmEmulator.fault`, and docs/reference/virtual-devices.md."""
         try:
-            return self._controller.fault(name, timeout=REPLY_TIMEOUT, **arguments)
+            return self._controller.fault(name, **arguments)
         except VirtualControllerError as error:
             raise LaboratoryError(str(error)) from error
 

@@ -18,6 +18,9 @@ from actors.runtime.child_process import ChildProcess, python_module
 START_TIME = 120.0
 """Longest wait until the process is ready [s]."""
 
+REPLY_TIME = 50.0
+"""Longest wait for a reply of the process [s], on a machine that may be busy."""
+
 
 class VirtualControllerError(Exception):
     """The process does not start, or refuses a fault; the text gives the reason."""
@@ -95,7 +98,7 @@ class VirtualController:
                 f"virtual controller at {address}: not ready within {timeout:g} s: {reason}"
             ) from error
 
-    def fault(self, name: str, *, timeout: float = 5.0, **arguments: Any) -> dict[str, Any]:
+    def fault(self, name: str, *, timeout: float = REPLY_TIME, **arguments: Any) -> dict[str, Any]:
         """Inject a fault, or read the controller's internal state; see docs/reference/virtual-devices.md for names.
 
         Args:

@@ -383,7 +383,7 @@ async def test_a_simulator_with_other_code_than_this_machine_s_is_not_used_and_n
 
 @pytest.mark.realtime
 @pytest.mark.ray
-async def test_a_loss_is_told_with_what_is_repeated(ray_running, fake, task, tmp_path):
+async def test_a_loss_is_told_with_what_is_repeated_and_only_once(ray_running, fake, task, tmp_path, capsys):
     told, log = [], tmp_path / "log"
     pool = ray_pool(1, make=fake(0.5, log), tell=told.append)
     jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in range(2)]
@@ -394,6 +394,7 @@ async def test_a_loss_is_told_with_what_is_repeated(ray_running, fake, task, tmp
     await pool.close()
     assert "1 simulator(s) lost" in told[0]
     assert "2 simulation(s) are repeated" in told[0]
+    assert "raylet" not in "".join(capsys.readouterr())  # Ray says it before it gives up the task
 
 
 @pytest.mark.realtime

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from actors.arm.planned_pour import PourPath
 from actors.arm.ur.ur_driver import UrArm
 from actors.contract_tests import contract_calls
 from actors.emulators.ur_controller import VirtualController
+from actors.runtime.bench_clock import SharedClock
 from tests.support.loopback import free_address
 from tests.support.ur_pours import HOME, START, pour_path, settings
 from tests.support.waiting import PATIENCE
@@ -111,11 +113,14 @@ class Makers:
         self._made: list[Rig] = []
 
     def __call__(self, path: PourPath | None = None, connect: bool = True, **changes: Any) -> Rig:
-        """A controller at home, and an arm that is connected to it."""
+        """A controller at home, and an arm that is connected to it; `clock` is the file of a clock that they share."""
         scale = changes.pop("time_scale", SCALE)
         options: dict[str, Any] = {"model": changes.pop("there", "ur10e"), "time_scale": scale, "joints": HOME}
         options["frequency"] = changes.pop("frequency", 125.0)
         options["polyscope_x"] = changes.pop("polyscope_x", False)
+        if clock := changes.get("clock"):
+            SharedClock.create(Path(clock))
+            options["clock"] = clock
         controller = VirtualController.start(address=free_address(), **options)
         arm = UrArm(settings(controller.address, time_scale=scale, **changes))
         rig = Rig(controller, arm, path or pour_path())

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from actors.arm.ur.ur_driver import UrArm
 from actors.contract_tests.arm_contract import ArmBench, ArmContract
 from actors.emulators.ur_controller import VirtualController
 from actors.emulators.ur_controller.robot import MODELS, calibrated
+from actors.runtime.bench_clock import SharedClock
 from sim_engine.action import DEG
 from tests.actors.arm.ur.test_executed_motion import ACTION, motion, vessels
 from tests.support.loopback import free_address
@@ -26,10 +29,17 @@ from tests.support.planning_cell import cell_of
 
 
 def bench_of(cls: type[UrArm], model: str = "ur10e", *, polyscope_x: bool = False) -> Iterator[ArmBench]:
-    """An arm and its controller, whose true joints are the witness. The robot is calibrated, as a real one is."""
+    """An arm and its controller, whose true joints are the witness. The robot is calibrated, as a real one is. The
+    clock waits for its driver, as on a virtual bench.
+    """
     true = cell_of(model, warning_time=0.0, time_scale=5.0, calibration=calibrated(MODELS[model]).calibration)
     options = {"calibrated": True, "polyscope_x": polyscope_x, "joints": true.home.angles}
-    with VirtualController.start(free_address(), true.model, true.time_scale, 125.0, **options) as controller:
+    with contextlib.ExitStack() as stack:
+        clock = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "clock"
+        SharedClock.create(clock)
+        options["clock"] = str(clock)
+        controller = VirtualController.start(free_address(), true.model, true.time_scale, 125.0, **options)
+        stack.enter_context(controller)
 
         def true_poses(since: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
             kept = controller.fault("history", since=max(since + 1e-6, 0.0))
@@ -38,7 +48,7 @@ def bench_of(cls: type[UrArm], model: str = "ur10e", *, polyscope_x: bool = Fals
                 return np.zeros(0), np.zeros((0, 7))
             return times, pourer_motion(joints, times, true).poses
 
-        arm = cls(true.with_values(address=controller.address, calibration=None))
+        arm = cls(true.with_values(address=controller.address, calibration=None, clock=str(clock)))
         spec = true.fitted_to(arm.connect())
         path = plan_path(motion(ACTION.with_values(angular_velocity=25 * DEG)), spec, *vessels())
         yield ArmBench(

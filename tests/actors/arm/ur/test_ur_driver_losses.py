@@ -13,17 +13,20 @@ import struct
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from actors.arm.arm_interface import ArmError, ArmLostError, ArmNotReleasedError, ArmRefusedError, ArmStoppedError
 from actors.arm.planned_pour import JointPath
 from actors.arm.ur import rtde
+from actors.arm.ur.rtde_client import has_library
 from actors.arm.ur.ur_driver import UrArm
 from actors.arm.ur.urscript_writer import path_program
 from actors.arm.ur.worker_messages import MotionSettings
@@ -104,6 +107,43 @@ def test_a_lost_line_ends_the_pour_and_the_arm_stands_until_released(make_rig: M
     stood_soon(rig, began, 1.5)
     rig.fault("clear")
     goes_on_only_by_an_operator(rig)
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+@pytest.mark.skipif(not has_library(), reason="without ur-rtde, nothing gives up")
+@pytest.mark.parametrize("late", ["controller", "worker"])
+def test_a_pour_is_completed_though_the_library_gave_up_on_a_late_host(
+    make_rig: Make, tmp_path: Path, late: str
+) -> None:
+    rig = make_rig(LONG_TILT, time_scale=FASTER, clock=str(tmp_path / "clock"))
+    pouring = rig.pouring()
+    rig.await_tilt(0.15)
+    worker = psutil.Process(rig.worker)
+
+    def connections() -> set[int]:
+        return {c.laddr.port for c in worker.net_connections() if c.raddr and c.raddr.port == rtde.PORT}
+
+    before = connections()
+    stopped = rig.controller.pid if late == "controller" else rig.worker
+    os.kill(stopped, signal.SIGSTOP)
+    if late == "controller":
+        rig.await_that(lambda: not before <= connections(), "the library's end of the connection")
+    else:
+        time.sleep(3.5)  # more than the 2.5 s after which the library gives up, also where its own thread was stopped
+    os.kill(stopped, signal.SIGCONT)
+    assert pouring.result() is not None
+    assert rig.joints == pytest.approx(START, abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+def test_a_connection_that_is_cut_ends_the_pour_on_a_virtual_bench_as_well(make_rig: Make, tmp_path: Path) -> None:
+    rig = make_rig(LONG_TILT, time_scale=FASTER, clock=str(tmp_path / "clock"))
+    pouring = rig.pouring()
+    rig.await_tilt(0.15)
+    rig.fault("drop")
+    assert "tilt" in str(lost(pouring))
 
 
 @pytest.mark.slow
