@@ -362,7 +362,7 @@ class VirtualOperator:
         if self._again > PERSISTENCE:
             if question.wants == "yes or no":
                 return "no"
-            raise LaboratoryError(f"the virtual operator gives up: {question.problem}")
+            raise LaboratoryError(f"the virtual operator gives up: {question.problem}. The question was: {question.text}")
         await self._hands.do(question)
         match question.wants:
             case "weight":

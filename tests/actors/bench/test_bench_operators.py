@@ -129,6 +129,18 @@ def test_a_virtual_operator_begins_a_series_with_new_cups_and_goes_on_with_those
         assert asyncio.run(operator.ask(question)) == answer
 
 
+def test_a_virtual_operator_that_gives_up_says_what_a_person_would_have_to_do() -> None:
+    operator = VirtualOperator(Hands(BenchContents(Placement.RECEIVER), None), 0.0)
+    question = OperatorQuestion("Weigh 'cup' and enter its content.", "done", "the account has no content for it yet")
+
+    async def ask() -> None:
+        while True:
+            await operator.ask(question)
+
+    with pytest.raises(LaboratoryError, match=r"has no content for it yet\. The question was: Weigh 'cup'"):
+        asyncio.run(ask())
+
+
 def test_an_empty_cup_that_is_laid_out_is_dry_and_a_source_is_filled_as_well_as_a_person_can() -> None:
     contents = BenchContents(Placement.RECEIVER)
     hands = Hands(contents, None)
