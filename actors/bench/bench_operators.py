@@ -362,7 +362,8 @@ class VirtualOperator:
         if self._again > PERSISTENCE:
             if question.wants == "yes or no":
                 return "no"
-            raise LaboratoryError(f"the virtual operator gives up: {question.problem}. The question was: {question.text}")
+            reason = f"{question.problem}. The question was: {question.text}"
+            raise LaboratoryError(f"the virtual operator gives up: {reason}")
         await self._hands.do(question)
         match question.wants:
             case "weight":
