@@ -288,9 +288,8 @@ def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float) -> None:
             # this command announces each movement itself, by counting down before it lets the arm move
             driver = ready.with_values(arm=ready.arm.with_values(warning_time=0.0))
             with connected(driver, checksum) as (arm, facts):
-                fitted = ready.arm.fitted_to(facts)
-                if fitted != ready.arm:
-                    path = arm_kind(fitted).plan(chosen.scene, action).slowed(slow)
+                fitted = ready.arm.fitted_to(facts)  # the path shown is that of the expected lengths
+                path = arm_kind(fitted).plan(chosen.scene, action).slowed(slow)
                 cycle = EmptyCycle(arm, path, ready.arm.on_clock(laboratory.arm.warning_time), ask=hardware)
                 executed = cycle.run()
     except OSError as error:
