@@ -47,7 +47,7 @@ $(GENERATOR): $(READY)
 	$(BIN)/python -m venv build/openapi
 	build/openapi/bin/python -m pip install --quiet --disable-pip-version-check openapi-python-client==0.29.1
 
-# What takes long, and every property on four times as many examples. DECANT_TESTS_PART=2/6 runs every sixth file.
+# What takes long, and every property on four times as many examples. DECANT_TESTS_PART=2/8 runs every eighth file.
 slow: $(READY)-test $(GENERATOR)
 	DECANT_OPENAPI_CLIENT=$(abspath $(GENERATOR)) DECANT_THOROUGH=1 $(BIN)/pytest -m "(slow or hypothesis) and not physics" -n 2 $(BY_FILE)
 
