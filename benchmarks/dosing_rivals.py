@@ -80,7 +80,7 @@ class Rival:
             self._turn_back()
         speed = getattr(self, "_" + self.phase)(step)
         self._speed = speed
-        return TiltCommand(speed, self.phase == "done")
+        return TiltCommand(speed, finished=self.phase == "done")
 
     def _check(self, step: float) -> float:
         last = [r.mass for r in self._readings[-4:]]

@@ -417,14 +417,14 @@ class DoseController:
     def _bounded(self, speed: float) -> TiltCommand:
         """The command of a speed [rad/s], with what the arm may do if no further one follows."""
         if self.phase not in (DosePhase.APPROACH, DosePhase.POUR, DosePhase.RETURN):
-            return TiltCommand(speed, 0.0, finished=self.phase is DosePhase.DONE)
+            return TiltCommand(speed, highest=0.0, finished=self.phase is DosePhase.DONE)
         ahead = self._arm.ahead
         highest = ahead + max(speed, 0.0) * AHEAD * self._arm.tick
         if self.phase is DosePhase.APPROACH and ahead < self._onset:
             highest = self._onset
         if self.phase is DosePhase.RETURN or self._overdue() > 0.0:
             highest = min(highest, self._arm.command.highest)
-        return TiltCommand(speed, highest, self._patience_of(speed, highest))
+        return TiltCommand(speed, highest=highest, patience=self._patience_of(speed, highest))
 
     def _patience_of(self, speed: float, highest: float) -> float:
         """The longest time without a command after which the dose still stays within its tolerance [s]."""

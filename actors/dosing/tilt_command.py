@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 from actors.arm.arm_interface import NEWS_TIMEOUT
 from actors.dosing.dose_estimator import DoseEstimator
@@ -25,6 +25,7 @@ class TiltCommand:
     """
 
     speed: float
+    _: KW_ONLY
     highest: float = math.inf
     patience: float = NEWS_TIMEOUT
     finished: bool = False
@@ -45,7 +46,7 @@ class CommandedArm:
 
     def __init__(self, settings: DosingSettings) -> None:
         self._settings = settings
-        self.now, self.tilt, self.tick, self.command = 0.0, 0.0, 0.05, TiltCommand(0.0, 0.0)
+        self.now, self.tilt, self.tick, self.command = 0.0, 0.0, 0.05, TiltCommand(0.0, highest=0.0)
         self._reported = self._reported_at = -math.inf
 
     def report(self, time: float, tilt: float, *, moves: bool) -> float:
