@@ -183,7 +183,8 @@ class ExecutedPath:
     """The motion that an arm's own encoders measured.
 
     Attributes:
-        times: (T,) since the path's start, increasing from 0 [s of controller time], at least 100 Hz.
+        times: (T,) since the path's start, increasing from 0 [s of controller time], at 100 Hz or more where the arm
+            followed its path.
         joints: (T, n) [rad].
         completed: False if it was stopped before its end.
         tracking: errors in following the path: 'rms_angle', 'max_angle' [rad] of the joints, 'rms_tool', 'max_tool'

@@ -41,7 +41,7 @@ class UrArmSettings(JointArmSettings):
     """Waiting pose of the arm, with the pourer upright."""
 
     rate: Annotated[float, Quantity("1/s", "125 Hz", 100.0, 500.0)] = 125.0
-    """Rate at which the joints are read back."""
+    """Rate at which the joints are read back; readings missing between two on the planned path are taken from it."""
 
     registers: Annotated[int, Strict(), Field(ge=0, le=44), NOT_IN_FINGERPRINT] = 43
     """First of the three integer inputs of the controller that are written, and of the four double inputs that a dose

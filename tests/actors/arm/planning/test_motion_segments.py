@@ -146,6 +146,26 @@ def test_missed_packages_show_as_a_gap() -> None:
     assert tracking["longest_gap"] == pytest.approx(0.504, abs=0.01)
 
 
+def test_an_arm_whose_readings_were_lost_has_followed_its_path() -> None:
+    """A virtual arm at thirty times its speed next to busy processes: three readings of a whole pour."""
+    tilting = np.array([0.0, 0.05, POUR.pour.duration - 0.1])
+    samples = [(t, tuple(q), t) for t, q in zip(tilting, POUR.pour.at(tilting), strict=True)]
+    executed = executed_path(samples, POUR.pour, settings(), completed=True)
+    assert np.abs(executed.joints - POUR.pour.at(executed.times)).max() < 1e-6
+    assert np.diff(executed.times).max() < 0.013
+    assert executed.tracking["longest_gap"] == pytest.approx(np.diff(tilting).max())
+    straight = JointPath(tilting, POUR.pour.at(tilting)).at(executed.times)
+    assert np.abs(straight - executed.joints).max() > 1.0, "the readings alone would have told the same motion"
+
+
+def test_an_arm_that_was_off_its_path_next_to_a_gap_is_not_taken_to_have_followed_it() -> None:
+    times = np.array([t for t in np.arange(0.0, POUR.pour.duration, 0.008) if not 0.7 < t < 1.3])
+    joints = POUR.pour.at(np.where(times > 1.0, times - 0.6, times))
+    samples = [(t, tuple(q), t) for t, q in zip(times, joints, strict=True)]
+    executed = executed_path(samples, POUR.pour, settings(), completed=True)
+    assert np.diff(executed.times).max() == pytest.approx(0.6, abs=0.02)
+
+
 # ---- small steps
 
 
