@@ -34,8 +34,11 @@ PAGE_NAME, DATA_NAME, IMAGES = "evidence/validation.md", "data/validation.json",
 PANELS_ABREAST = 3
 """Maximum number of panels per row."""
 
-CHARACTER = 0.075
+CHARACTER = 0.066
 """Width of a character in a legend [inch]."""
+
+LINE = 0.2
+"""Height of a legend's line [inch]."""
 
 FEW = 20
 """Number of points from which a reference is drawn as a line."""
@@ -88,8 +91,10 @@ def draw(figure: Figure, path: Path) -> Path:
     columns = min(panels, PANELS_ABREAST)
     rows = -(-panels // columns)
     wide, high = (6.2, 3.9) if panels == 1 else (3.4, 2.7)
-    canvas, axes = figure_style.new_figure(rows, columns, size=(wide * columns, 0.5 + high * rows), squeeze=False)
     styles = _curve_styles(figure)
+    abreast = max(1, min(int(wide * columns / (0.55 + CHARACTER * max(map(len, styles), default=1))), len(styles)))
+    legend = LINE * -(-len(styles) // abreast)
+    canvas, axes = figure_style.new_figure(rows, columns, size=(wide * columns, high * rows + legend), squeeze=False)
     for number, place in enumerate(axes.flat):
         if number < panels:
             _panel(place, figure, number, styles)
@@ -98,9 +103,8 @@ def draw(figure: Figure, path: Path) -> Path:
     # Below the panels, because inside it would cover curves.
     handles = {n: h for place in axes.flat for h, n in zip(*place.get_legend_handles_labels(), strict=True)}
     names = [name for name in styles if name in handles]
-    room = wide * columns / (0.55 + CHARACTER * max(map(len, names), default=1))
     canvas.legend(
-        [handles[name] for name in names], names, loc="outside lower center", ncols=max(1, min(int(room), len(names))),
+        [handles[name] for name in names], names, loc="outside lower center", ncols=abreast,
         fontsize=8.5, frameon=False,
     )  # fmt: skip
     return figure_style.save(canvas, path)
