@@ -41,7 +41,7 @@ from actors.runtime.remote_object import Device, LocalDevice, RayDevice
 from actors.simulators.job_runner import Simulator, give_back, pour_simulator
 from actors.simulators.local_worker import process_pool, thread_pool
 from actors.simulators.pool import PoolShare, WorkerPool
-from actors.simulators.ray_worker import BESIDE_VIRTUAL, NICENESS, ray_pool
+from actors.simulators.ray_worker import NICENESS, ray_pool
 from sim_engine.engine_package import engine_name
 from sim_engine.errors import EngineError
 from sim_engine.resources import EXTRAS, PACKAGES, cache_directory, installed
@@ -419,7 +419,7 @@ class RayLaboratory(_OpenLaboratory):
 
     def _ray_pool(self) -> WorkerPool:
         if self._cluster is None:
-            niceness = BESIDE_VIRTUAL if self._spec.mode == "virtual" else NICENESS
+            niceness = 0 if self._spec.mode == "virtual" else NICENESS
             return ray_pool(self._spec.simulator_count, self._make, niceness=niceness, tell=self._tell_loss)
         pool = ray_pool(
             self._spec.simulators or self._cluster.cpus,

@@ -46,9 +46,9 @@ from sim_engine.scene import PourTask
 from sim_engine.vessel.mesh_shape import MeshShape
 from sim_engine.vessel.shapes import VesselSpec
 
-NICENESS, BESIDE_VIRTUAL = 15, 5
-"""Priorities of simulators, below the arm's driver, the optimiser and other programs [nice]; the second one where no
-real arm moves, since at 15 they get next to nothing beside other busy programs.
+NICENESS = 15
+"""Priority of simulators [nice], below the arm's driver, the optimiser and other programs. Where no real arm moves it
+is 0: next to busy programs, simulators at 15 would get next to nothing, and a virtual bench waits for its programs.
 """
 
 CONTROL, LIFE = "control", "life"
