@@ -12,6 +12,7 @@ import pytest
 from matplotlib.collections import PathCollection
 from matplotlib.text import Text
 
+from orchestrator.learning.dispense import Dose, DoseSignals
 from orchestrator.reports import figure_style as style
 from orchestrator.reports import run_figures as figures_module
 from orchestrator.reports.console_view import summary_table
@@ -24,6 +25,7 @@ from orchestrator.reports.run_figures import (
     deployment_picture,
     discrepancy_groups,
     draw_discrepancy,
+    draw_dose,
     draw_figures,
     draw_losses,
     loss_series,
@@ -253,6 +255,22 @@ def test_a_single_pour_is_drawn_with_its_whole_prediction() -> None:
     shown = [draw_losses([series], cost="loss [%]", title="").axes[0].get_ylim()[1] for series in (one, two)]
     assert shown[0] > 6.7
     assert shown[1] < 1.0  # several measured values remain apart
+
+
+def test_a_dose_is_drawn_until_its_receiver_is_taken_off_the_balance() -> None:
+    """Of a rack: the arm carries the filled cup of 90 g away while the balance is still read."""
+    signals = DoseSignals(
+        times=(0.0, 1.5, 11.0),
+        tilt_deg=(0.0, 47.0, 0.0),
+        read_at=(0.0, 0.1, 8.0, 14.0, 14.7, 14.8, 14.9),
+        readings_g=(0.0, -9.0, 59.6, 59.6, 4.0, -89.0, 0.0),
+    )
+    dose = Dose(
+        number=2, wanted_g=60.0, received_g=59.6, spilled_g=None, duration_s=14.7, end="reached", signals=signals
+    )
+    drawn = draw_dose(dose)
+    (points,) = (line for line in drawn.axes[0].lines if line.get_label() == "reading")
+    assert points.get_ydata() == pytest.approx([0.0, -9.0, 59.6, 59.6, 4.0])
 
 
 def test_quantities_are_shown_in_the_units_that_people_type() -> None:
