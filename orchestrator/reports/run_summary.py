@@ -108,7 +108,7 @@ class PourSummary(WeighedMasses):
     """The predicted loss; '' without a prediction."""
 
     measured: str
-    """The measured loss, or the reason of a failure; '' until then."""
+    """The measured loss, for a dose the received mass, or the reason of a failure; '' until then."""
 
     loss: str
     """Meaning of `predicted` and `measured`, such as 'spilled / poured': each loss has its own denominator."""

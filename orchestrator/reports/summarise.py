@@ -260,6 +260,7 @@ def pour_summary(plan: CampaignPlan | None, pour: RunPour, *, live: bool = False
         came = f"{1e3 * measured.delivered:.2f} g received"
     action = style.display_values({name: values[name] for name in names})
     receiver = request.scene if plan is None else receiver_names(plan).get(request.scene, request.scene)
+    meaning = unit.meaning if request.dose is None else "received"
     if request.dose is not None:
         action = f"{1e3 * request.dose.amount:g} g wanted"
         if request.dose.cup and request.dose.source is not None:
@@ -275,7 +276,7 @@ def pour_summary(plan: CampaignPlan | None, pour: RunPour, *, live: bool = False
         action_si=values,
         predicted="" if request.predicted is None else unit.prediction(request.predicted),
         measured=pour.reason if state == "failed" else came,
-        loss=unit.meaning,
+        loss=meaning,
         best=best,
         remark=_remark(state, pour),
         **masses.model_dump(),

@@ -57,6 +57,7 @@ async def test_a_queued_series_shows_its_doses_while_it_runs_and_reports_them(tm
         assert found["state"] == "finished"
         pours = found["pours_made"]
         assert [pour["action"] for pour in pours] == ["20 g wanted", "25 g wanted"]
+        assert {pour["loss"] for pour in pours} == {"received"}, "what is shown as measured is named for what it is"
         received = [float(pour["measured"].removesuffix(" g")) for pour in pours]
         assert received == pytest.approx([20.0, 25.0], abs=2.0)
         answer = await served.http.get(f"/api/v1/campaigns/{key}/report", headers=served.headers())
