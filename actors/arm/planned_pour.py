@@ -180,7 +180,7 @@ class PlaceWay:
 
 @dataclass(frozen=True, eq=False)
 class ExecutedPath:
-    """The motion that an arm's own encoders measured.
+    """The motion that an arm's own encoders measured; a driver may fill gaps between two readings on the planned path.
 
     Attributes:
         times: (T,) since the path's start, increasing from 0 [s of controller time], at 100 Hz or more where the arm

@@ -352,10 +352,9 @@ def draw_dose(dose: Dose) -> Figure:
     received = "unknown" if dose.received_g is None else f"{dose.received_g:.1f} g received"
     style.entitle(figure, f"Dose {dose.number}: {dose.wanted_g:g} g wanted, {received}")
     times, readings = np.array(signals.read_at), np.array(signals.readings_g)
-    # An arm that carries the receiver takes it off the balance before the last readings.
-    taken = (times > signals.times[-1]) & (readings < -0.1 * dose.wanted_g)
-    stood = ~np.logical_or.accumulate(taken)
-    axes[0].plot(times[stood], readings[stood], ".", color=style.MEASURED, label="reading")
+    if dose.duration_s is not None:  # later readings are of another load, once an arm takes the receiver away
+        times, readings = times[times <= dose.duration_s], readings[times <= dose.duration_s]
+    axes[0].plot(times, readings, ".", color=style.MEASURED, label="reading")
     axes[0].axhline(dose.wanted_g, color=style.BEST, linewidth=1.0, label="wanted")
     axes[0].legend(loc="center left", fontsize=9, frameon=False)
     axes[1].plot(signals.times, signals.tilt_deg, color=style.POURER)

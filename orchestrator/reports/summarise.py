@@ -260,8 +260,9 @@ def pour_summary(plan: CampaignPlan | None, pour: RunPour, *, live: bool = False
         came = f"{1e3 * measured.delivered:.2f} g received"
     action = style.display_values({name: values[name] for name in names})
     receiver = request.scene if plan is None else receiver_names(plan).get(request.scene, request.scene)
-    meaning = unit.meaning if request.dose is None else "received"
+    meaning = unit.meaning
     if request.dose is not None:
+        meaning = "received"
         action = f"{1e3 * request.dose.amount:g} g wanted"
         if request.dose.cup and request.dose.source is not None:
             receiver, action = request.dose.cup, f"{action} from {request.dose.source.name}"

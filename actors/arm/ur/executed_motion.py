@@ -22,9 +22,6 @@ from actors.arm.ur_settings import UrArmSettings
 LONGEST_LAG = 0.3
 """Largest lag that is searched to explain the difference between path and readings [s]."""
 
-STEP = 0.008
-"""Time between two readings of a controller that sends all of them, 125 Hz [s]."""
-
 ON_PATH = 0.01
 """Largest difference of a joint between a reading and the path, if the arm follows the path [rad]."""
 
@@ -44,8 +41,8 @@ def executed_path(
     arrival times of packages. They run alike unless the controller slowed the motion; then the two are compared at the
     program's time, and the readings keep the controller's.
 
-    Readings get lost on a busy computer, and a virtual arm that moves thirty times as fast sends four a second of its
-    time. Between two readings on the path the arm has followed the path, so a gap is filled with it.
+    Readings get lost on a busy computer, and a virtual arm at thirty times its speed sends about four per second of
+    its time. Between two readings on the path the arm is taken to have followed it, and the path fills the gap.
 
     Args:
         samples: in the order of their times.
@@ -77,28 +74,29 @@ def executed_path(
     if tracking and slowed:
         tracking["longest_gap"] = float(np.diff(times).max())
     if tracking:
-        times, joints = _filled(times, joints, planned - tracking["lag"], path)
+        times, joints = _filled(times, joints, planned - tracking["lag"], path, spec.rate)
     poses = pourer_motion(joints, times, spec).poses if len(times) > 1 else np.zeros((0, 7))
     return ExecutedPath(times, joints, completed, tracking | {"slider": slider}, poses, _forces(forces))
 
 
 def _filled(
-    times: FloatArray, joints: FloatArray, planned: FloatArray, path: JointPath
+    times: FloatArray, joints: FloatArray, planned: FloatArray, path: JointPath, rate: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Readings with points of the path between them, at most `STEP` apart.
+    """Readings with points of the path between them where some are missing.
 
     Args:
         times: (T,) of the readings [s].
         joints: (T, n) then [rad].
         planned: (T,) times on the path [s].
         path: the planned path.
+        rate: of readings if none is missing [1/s].
     """
     errors = joints - path.at(planned)
     follows = np.abs(errors).max(axis=1) < ON_PATH
     parts = []
     for k, gap in enumerate(np.diff(times)):
-        count = int(np.ceil(gap / STEP - 0.5)) if follows[k] and follows[k + 1] else 1
-        parts.append(k + np.arange(max(count, 1)) / max(count, 1))
+        count = max(round(gap * rate), 1) if follows[k] and follows[k + 1] else 1
+        parts.append(k + np.arange(count) / count)
     index, readings = np.concatenate([*parts, [len(times) - 1.0]]), np.arange(len(times))
     error = np.column_stack([np.interp(index, readings, column) for column in errors.T])
     return np.interp(index, readings, times), path.at(np.interp(index, readings, planned)) + error

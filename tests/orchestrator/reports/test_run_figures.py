@@ -266,11 +266,11 @@ def test_a_dose_is_drawn_until_its_receiver_is_taken_off_the_balance() -> None:
         readings_g=(0.0, -9.0, 59.6, 59.6, 4.0, -89.0, 0.0),
     )
     dose = Dose(
-        number=2, wanted_g=60.0, received_g=59.6, spilled_g=None, duration_s=14.7, end="reached", signals=signals
+        number=2, wanted_g=60.0, received_g=59.6, spilled_g=None, duration_s=14.1, end="reached", signals=signals
     )
     drawn = draw_dose(dose)
     (points,) = (line for line in drawn.axes[0].lines if line.get_label() == "reading")
-    assert points.get_ydata() == pytest.approx([0.0, -9.0, 59.6, 59.6, 4.0])
+    assert points.get_ydata() == pytest.approx([0.0, -9.0, 59.6, 59.6])
 
 
 def test_quantities_are_shown_in_the_units_that_people_type() -> None:
