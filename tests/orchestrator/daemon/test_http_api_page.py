@@ -121,7 +121,7 @@ def test_a_question_is_answered_with_one_press_and_the_pour_goes_on(page: Any, t
         page.get_by_role("heading", name="Fill the pourer and put it on the tray.").wait_for()
         page.get_by_text("A question: Fill the pourer").wait_for(state="attached")
         assert page.locator("#call").get_attribute("aria-live") == "assertive"
-        assert "(1) question" in page.title()
+        wait_until(page, lambda: "(1) question" in page.title())
         page.get_by_role("button", name="Done").click()
         wait_until(page, lambda: lab.served.laboratories[0].bench.answers[:1] == ["done"])
         wait_until(page, lambda: lab.do(lab.served.get(f"/campaigns/{key}"))["pours_made"][0]["state"] == "weighed")
@@ -226,7 +226,7 @@ def test_the_emergency_stop_is_one_press_and_is_latched_until_it_is_cleared(page
         page.get_by_text("tilting").wait_for()
         page.get_by_role("button", name="EMERGENCY STOP").click()
         page.get_by_role("heading", name="Emergency stop").wait_for()
-        assert laboratory.arm_stops == 1
+        wait_until(page, lambda: laboratory.arm_stops == 1)
         assert lab.do(lab.served.until(key, "unknown"))["state"] == "unknown"
         page.locator("header").get_by_text("STOPPED").wait_for()
         page.get_by_role("button", name="Clear the stop").click()
@@ -249,7 +249,7 @@ def test_signed_out_the_page_claims_no_stop_and_names_the_physical_one(page: Any
         page.get_by_role("heading", name="Emergency stop").wait_for()
         page.locator("header").get_by_text("STOPPED").wait_for()
         assert not page.locator("#no-stop").is_visible()
-        assert page.title().startswith("STOPPED")
+        wait_until(page, lambda: page.title().startswith("STOPPED"))
 
         unknown = {"detail": "this token is not known"}
         page.route("**/api/v1/**", lambda route: route.fulfill(status=401, json=unknown))
@@ -501,7 +501,7 @@ def test_the_rack_of_mixtures_fills_and_is_the_same_after_a_reload(page: Any, tm
         key = lab.do(lab.served.submit())
         lab.do(lab.served.pouring()).bench.begun.clear()
         page.locator("#racks img").wait_for()
-        assert rack_of(page) == {"B2": "being filled", "A1": "empty"}
+        wait_until(page, lambda: rack_of(page) == {"B2": "being filled", "A1": "empty"})
         page.get_by_text("As a table").click()
         lab.served.laboratories[0].bench.go.set()
         wait_until(page, lambda: rack_of(page) == {"B2": "done", "A1": "done"})
@@ -521,7 +521,7 @@ def test_a_daemon_that_was_started_again_shows_the_cup_that_is_unknown(page: Any
         lab.do(lab.served.pouring())
         page.goto(lab.address())
         page.locator("#racks img").wait_for()
-        assert rack_of(page) == {"B2": "being filled", "A1": "empty"}
+        wait_until(page, lambda: rack_of(page) == {"B2": "being filled", "A1": "empty"})
         for _ in range(2):
             lab.do(lab.served.post(f"/campaigns/{key}/abort"))
         lab.do(lab.served.until(key, "unknown"))
@@ -529,11 +529,11 @@ def test_a_daemon_that_was_started_again_shows_the_cup_that_is_unknown(page: Any
     with on_port(tmp_path, held_dose, campaign=MIXTURES) as lab:
         page.goto(lab.address())
         page.locator("#racks img").wait_for()
-        assert rack_of(page) == {"B2": "UNKNOWN", "A1": "empty"}
+        wait_until(page, lambda: rack_of(page) == {"B2": "UNKNOWN", "A1": "empty"})
         lab.do(lab.served.post(f"/campaigns/{key}/resume"))
         lab.do(lab.served.question())
         page.get_by_role("button", name="Lost: outcome unknown").wait_for()
-        assert rack_of(page) == {"B2": "UNKNOWN", "A1": "empty"}
+        wait_until(page, lambda: rack_of(page) == {"B2": "UNKNOWN", "A1": "empty"})
         page.get_by_role("button", name="Lost: outcome unknown").click()
         wait_until(page, lambda: rack_of(page) == {"B2": "UNKNOWN", "A1": "being filled"})
 
