@@ -19,8 +19,9 @@ the amount in the receiver, if it is known.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -168,7 +169,7 @@ ABRUPT = 0.06
 and raises a wave at the lip."""
 
 LATEST_ONSET = math.radians(1.5)
-"""Tilt by which outflow can begin later than expected, even after many doses: the lip may have dried [rad]."""
+"""Tilt by which outflow can begin later than expected [rad]."""
 
 SEEN_AFTER = 0.5
 """Time until a stream is seen on a balance that repeats no reading [s]."""
@@ -221,6 +222,7 @@ class PriorStream:
         slowest: whether it is the slowest plausible one.
 
     Attributes:
+        begin: past the lip before the cup was tilted the last time [kg].
         mass: past the lip [kg].
         flow: now [kg/s].
     """
@@ -229,11 +231,19 @@ class PriorStream:
         self._cup = cup
         self._volume, self._onset = float(belief.volume.mean()), float(belief.onset_bias.mean())
         self._factor = median(belief.flow_factor)
+        self._least = 1.5e-3  # [kg]
         if slowest:
+            self._least = 2.5e-3
             self._volume -= 2.0 * float(belief.volume.std())
             self._onset += max(2.0 * float(belief.onset_bias.std()), LATEST_ONSET)
             self._factor *= 0.7
-        self.mass = self.flow = 0.0
+        self.begin = self.mass = self.flow = self._time = 0.0
+        self._past: deque[tuple[float, float]] = deque(maxlen=100)  # times [s] and masses, the newest first
+
+    def restart(self, mass: float) -> None:
+        """So much [kg] has arrived, and nothing is on its way."""
+        self.begin = self.mass = mass
+        self._past.clear()
 
     def advance(self, seconds: float, tilt: float, amount: float) -> None:
         """Integrate it over a time [s] at a tilt [rad].
@@ -248,10 +258,13 @@ class PriorStream:
         flow = self._factor * float(self._cup.flow(head, tilt)[0]) if head[0] > 0.0 else 0.0
         self.flow = flow * self._cup.density
         self.mass += self.flow * min(seconds, 0.2)
+        self._time += seconds
+        self._past.appendleft((self._time, self.mass))
 
-    def lacks(self, arrived: float) -> bool:
-        """Whether an amount in the receiver [kg] is far behind."""
-        return self.mass - arrived > max(2.5e-3, 0.3 * self.mass)
+    def lacks(self, arrived: float, delay: float = 0.0) -> bool:
+        """Whether an amount in the receiver [kg] is far behind what has left the cup before a delay [s]."""
+        due = next((mass for time, mass in self._past if time <= self._time - delay), 0.0) if delay > 0.0 else self.mass
+        return due - arrived > max(self._least, 0.3 * due)
 
 
 @dataclass(frozen=True)
@@ -309,13 +322,19 @@ class DoseController:
         in_time: bool = False,
     ) -> None:
         self._cup, self._order, self._settings, self._in_time = cup, order, settings, in_time
+        # what arrives late is a film of the last flow, which is slower in a small dose
+        self._share = min(order.amount / FINE_TIME / settings.largest_fine_flow, 1.0)
+        estimated = replace(belief, aim=self._share * belief.aim)
         self._estimator = DoseEstimator(
-            cup, belief, fall_time=fall_time, step=step, noise=noise, rng=np.random.default_rng((seed, 5))
+            cup, estimated, fall_time=fall_time, step=step, noise=noise, rng=np.random.default_rng((seed, 5))
         )
         self._belief = belief
         self._readings = DoseReadings(belief.display, self._estimator.repeats, step=step, noise=noise)
         self._arm = CommandedArm(settings)
-        self._latest, self._usual = (PriorStream(cup, belief, slowest=slowest) for slowest in (True, False))
+        # of a cup that is known, the readings were never more than 13 % behind the usual stream in 280 doses
+        self._latest, self._usual = (
+            PriorStream(cup, belief, slowest=slowest) for slowest in (belief.doses == 0, False)
+        )
         self._return_path = Return()
         self.phase = DosePhase.CHECK
         self.result: DoseResult | None = None
@@ -559,7 +578,8 @@ class DoseController:
         # within one step of the display, the particles know more than it shows
         likely = min(max(float(self._estimator.mass.mean()), amount - step), amount + step)
         missing = max(self._departed, self._latest.mass) - amount
-        if self._suspected is not None and (self._flows_less() or self._latest.lacks(amount)):
+        flows_less = self._flows_less() and self._usual.lacks(amount)  # a film that surged has arrived all the same
+        if self._suspected is not None and (flows_less or self._latest.lacks(amount)):
             self._end = self._end or self._suspected
             self._missing = max(missing, self._usual.mass - amount) if self._end is DoseEnd.STREAM_MISSED else 0.0
         smallest = max(self._settings.smallest_top_up, 1.5 * step)
@@ -574,7 +594,9 @@ class DoseController:
                 self._rising, self._doubt_since, self._suspected, self._paused = 0, None, None, False
                 self._doubted = False
                 self._unchanged_since, self._estimator.repeats.run = self._arm.now, 0.0
-                self._latest.mass = self._usual.mass = self._departed = amount
+                self._latest.restart(amount)
+                self._usual.restart(amount)
+                self._departed = amount
                 self._enter(DosePhase.APPROACH)
                 return
             self._end = DoseEnd.SHORT
@@ -587,11 +609,12 @@ class DoseController:
 
     def _finish(self, end: DoseEnd, *, known: bool, amount: float = 0.0) -> None:
         self.phase = DosePhase.DONE
-        aim = self._aim()
+        aim = self._aim() / self._share
         if self._expected is not None and known and end in (DoseEnd.REACHED, DoseEnd.MISSED):
-            # aim += max(1/4, 1/(n + 2)) (late − aim): mean of the doses so far, later an exponential average
+            # aim += max(1/4, 1/(n + 2)) s (late − s aim), s the share: mean of the doses so far, later an exponential
+            # average
             late = min(max(amount - self._expected, -1e-3), 1e-3)
-            aim += max(0.25, 1.0 / (self._belief.doses + 2)) * (late - aim)
+            aim += max(0.25, 1.0 / (self._belief.doses + 2)) * self._share * (late - self._aim())
         weighed = amount if known else None
         self.result = DoseResult(
             end,
@@ -599,7 +622,7 @@ class DoseController:
             self.deviation,
             self.amount,
             self._top_ups,
-            self._estimator.belief(weighed=weighed, aim=aim),
+            self._estimator.belief(weighed=weighed, aim=aim, missing=self._missing),
             self._estimator.innovations,
             self._missing,
         )
@@ -648,7 +671,7 @@ class DoseController:
         """Mass to subtract from the target [kg]."""
         clean = self._cup.density * self._cup.clean_flow(max(self._arm.tilt, 0.1))
         late = DRIBBLES if self._belief.doses == 0 and self.fine_flow < clean else 0.0
-        return self._belief.aim + late
+        return self._share * (self._belief.aim + late)
 
     # ---- readings and doubts
 
@@ -692,7 +715,7 @@ class DoseController:
     @property
     def _threshold(self) -> float:
         """Net reading above which liquid has arrived [kg]."""
-        return (self._latest.mass if self._top_ups else 0.0) + max(SEEN, 2.5 * self._readings.step)
+        return self._latest.begin + max(SEEN, 2.5 * self._readings.step)
 
     def _begins_to_rise(self) -> bool:
         """Whether the last readings rise, faster than the particles flow and as slowly as a stream can.
@@ -727,8 +750,9 @@ class DoseController:
             self._pause(self._lost_stream())
         elif self._nearly_empty():
             self._turn_back(DoseEnd.SOURCE_EMPTY)
-        elif readings.rate() < 0.5 * max(latest.flow, 1e-3) and (
-            latest.lacks(net + latest.flow) or (self.phase is DosePhase.POUR and self._flows_less())
+        elif readings.rate() < 0.7 * max(latest.flow, 1e-3) and (
+            latest.lacks(net, SEEN_AFTER + readings.blind + median(self._estimator.lag))
+            or (self.phase is DosePhase.POUR and self._flows_less())
         ):
             self._pause(self._lost_stream())
 

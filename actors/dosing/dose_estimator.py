@@ -606,19 +606,23 @@ class DoseEstimator:
             elapsed += dt
         return total
 
-    def belief(self, *, weighed: float | None, aim: float) -> DoseBelief:
+    def belief(self, *, weighed: float | None, aim: float, missing: float = 0.0) -> DoseBelief:
         """The belief after this dose.
 
         No cup's flow changes by `LARGEST_CHANGE` from one dose to the next: then half of the particles are as they were
-        before this one, which may have misled the others.
+        before this one, which may have misled the others. A stream that missed the receiver says nothing of the cup.
 
         Args:
             weighed: amount in the receiver after the dose [kg]; None if it is unknown.
             aim: see `DoseBelief.aim`.
+            missing: left the cup besides, with a standard deviation of its half [kg].
         """
         volume = self.volume
         if weighed is not None:  # the content of the receiver has left the source
             volume = np.maximum(self._belief.volume - weighed / self.cup.density, 0.0)
+        if missing > 0.0:
+            gone = missing * (1.0 + 0.5 * _even_normal(len(volume), self._rng)) / self.cup.density
+            return replace(self._belief, volume=np.maximum(volume - gone, 0.0), aim=aim)
         onset_bias, flow_factor = self.onset_bias.copy(), self.flow_factor.copy()
         if abs(float(np.log(flow_factor).mean() - np.log(self._belief.flow_factor).mean())) > math.log(LARGEST_CHANGE):
             onset_bias[::2], flow_factor[::2] = self._belief.onset_bias[::2], self._belief.flow_factor[::2]

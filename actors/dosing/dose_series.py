@@ -352,7 +352,7 @@ def after_dose(series: DoseSeries, result: DoseResult) -> dict[str, Any]:
         series: that the dose belongs to, after it.
         result: of the dose.
     """
-    content, (lost, deviation) = series.content, lost_by(result)
+    content = series.content
     return {
         "received": result.amount,
         "deviation": result.deviation,
@@ -360,7 +360,7 @@ def after_dose(series: DoseSeries, result: DoseResult) -> dict[str, Any]:
         "missing_mass": result.missing,
         "top_ups": result.top_ups,
         "innovations": result.innovations,
-        "left": [max(content.mass - lost, 0.0), math.hypot(content.deviation, deviation)],
+        "left": [max(content.mass - LOST[0], 0.0), math.hypot(content.deviation, LOST[1])],  # without what missed
         "knowledge": asdict(series.belief.knowledge()),
     }
 

@@ -413,6 +413,23 @@ def test_a_stream_that_arrives_in_part_is_stopped_at_the_first_weighing_and_its_
     assert bench.content == pytest.approx(mass, abs=3.0 * deviation)
 
 
+def test_a_receiver_that_was_moved_is_noticed_in_the_next_dose_and_what_is_known_of_the_cup_stays() -> None:
+    """The onset of a known cup is known better than before the first dose, and a stream beside it teaches nothing."""
+    bench = VirtualDosingBench(SPOUTED, WATER, TrueScale(lag=0.3), 1)
+    series = DoseSeries(CUP, DosingSettings(), SourceContent(0.3), bench.place_receiver(), np.random.default_rng(1))
+    ends, spilled = [], []
+    for seed, fault in enumerate((NO_FAULT, DosingFault("miss", 0.0), NO_FAULT)):
+        bench.place_receiver()
+        controller = series.controller(DoseOrder(0.06, receiver_mass=bench.receiver_mass), seed=seed)
+        spilled.append(bench.dose(controller, fault).spilled)
+        assert controller.result is not None
+        ends.append(controller.result.end)
+        series.finish(controller.result)
+    assert ends == [DoseEnd.REACHED, DoseEnd.STREAM_MISSED, DoseEnd.REACHED]
+    assert spilled[1] < 0.015  # 8 g per degree
+    assert 1e3 * series.content.mass == pytest.approx(1e3 * bench.content, abs=6.0)
+
+
 def test_an_empty_source_ends_the_dose_short() -> None:
     record, controller = one_dose(0.1, mass=0.08, believed=0.13)
     assert controller.result is not None
