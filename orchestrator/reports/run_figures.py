@@ -356,7 +356,7 @@ def draw_dose(dose: Dose) -> Figure:
         times, readings = times[times <= dose.duration_s], readings[times <= dose.duration_s]
     axes[0].plot(times, readings, ".", color=style.MEASURED, label="reading")
     axes[0].axhline(dose.wanted_g, color=style.BEST, linewidth=1.0, label="wanted")
-    axes[0].legend(loc="center left", fontsize=9, frameon=False)
+    axes[0].legend(loc="best", fontsize=9, frameon=False)
     axes[1].plot(signals.times, signals.tilt_deg, color=style.POURER)
     style.dress(axes[0], y="balance [g]")
     style.dress(axes[1], x="time [s]", y="tilt [deg]")
