@@ -233,8 +233,9 @@ class PriorStream:
         self._factor = median(belief.flow_factor)
         self._least = 1.5e-3  # [kg]
         if slowest:
-            self._least = 2.5e-3
             self._volume -= 2.0 * float(belief.volume.std())
+        if slowest and belief.doses == 0:  # of a known cup, readings were at most 13 % behind the usual stream
+            self._least = 2.5e-3
             self._onset += max(2.0 * float(belief.onset_bias.std()), LATEST_ONSET)
             self._factor *= 0.7
         self.begin = self.mass = self.flow = self._time = 0.0
@@ -331,10 +332,7 @@ class DoseController:
         self._belief = belief
         self._readings = DoseReadings(belief.display, self._estimator.repeats, step=step, noise=noise)
         self._arm = CommandedArm(settings)
-        # of a cup that is known, the readings were never more than 13 % behind the usual stream in 280 doses
-        self._latest, self._usual = (
-            PriorStream(cup, belief, slowest=slowest) for slowest in (belief.doses == 0, False)
-        )
+        self._latest, self._usual = (PriorStream(cup, belief, slowest=slowest) for slowest in (True, False))
         self._return_path = Return()
         self.phase = DosePhase.CHECK
         self.result: DoseResult | None = None

@@ -430,6 +430,22 @@ def test_a_receiver_that_was_moved_is_noticed_in_the_next_dose_and_what_is_known
     assert 1e3 * series.content.mass == pytest.approx(1e3 * bench.content, abs=6.0)
 
 
+def test_a_known_cup_with_less_than_was_stated_pours_its_dose() -> None:
+    """Its content is 30 g less, stated with a standard deviation of 15 g: it pours later than usual."""
+    bench = VirtualDosingBench(SPOUTED, WATER, TrueScale(lag=0.3), 1)
+    series = DoseSeries(CUP, DosingSettings(), SourceContent(0.3), bench.place_receiver(), np.random.default_rng(1))
+    for seed in (1, 2):
+        bench.place_receiver()
+        controller = series.controller(DoseOrder(0.06, receiver_mass=bench.receiver_mass), seed=seed)
+        record = bench.dose(controller)
+        assert controller.result is not None
+        series.finish(controller.result)
+        bench.refill(0.27)
+        series.fill(SourceContent(0.3, 0.015))
+    assert controller.result.end is DoseEnd.REACHED
+    assert record.spilled < 5e-3
+
+
 def test_an_empty_source_ends_the_dose_short() -> None:
     record, controller = one_dose(0.1, mass=0.08, believed=0.13)
     assert controller.result is not None
