@@ -5,8 +5,8 @@
 
 A series is six doses from one source vessel, in random order: 10, 25, 50, 100, 200 g and one more of these. The seed
 draws cup, filling, balance and their errors; the bench draws the rest. If the source holds too little, it is refilled
-and weighed. Development uses the seeds 0 to 99. The final seeds begin at 9000. Earlier final runs were at 5000 to 5059,
-6000 to 6059 and 7000 to 7049; their results led to changes, which were made on development seeds.
+and weighed. Development uses the seeds 0 to 99. The final seeds begin at 9100. Earlier final runs were at 5000 to 5059,
+6000 to 6059, 7000 to 7049 and 9000 to 9049; their results led to changes, which were made on development seeds.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from dosing_rivals import FastPid, LearnedPreact, OpenLoop, Pid, Preact, Rival, 
 DATA = ROOT / "docs" / "data" / "dosing.json"
 
 AMOUNTS = (0.010, 0.025, 0.050, 0.100, 0.200)
-FIRST_FINAL_SEED = 9000
+FIRST_FINAL_SEED = 9100
 PARTICLES = 100
 
 CUPS = {
