@@ -715,7 +715,7 @@ class DoseController:
     @property
     def _threshold(self) -> float:
         """Net reading above which liquid has arrived [kg]."""
-        return self._latest.begin + max(SEEN, 2.5 * self._readings.step)
+        return (self._latest.begin if self._top_ups else 0.0) + max(SEEN, 2.5 * self._readings.step)
 
     def _begins_to_rise(self) -> bool:
         """Whether the last readings rise, faster than the particles flow and as slowly as a stream can.
