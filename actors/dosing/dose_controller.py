@@ -213,13 +213,14 @@ LONGEST_CHECK = (4.0, 8.0)
 
 
 class PriorStream:
-    """The stream of a dose without its readings: the expected one, or the slowest plausible one, of which a reading far
-    behind it misses liquid.
+    """The stream of a dose without its readings: the usual one of a cup, or a slower one, of which a reading far behind
+    it misses liquid.
 
     Args:
         cup: flow of the source vessel.
         belief: from the doses before.
-        slowest: whether it is the slowest plausible one.
+        less: standard deviations by which the source holds less than expected.
+        slowest: whether onset and flow are the slowest plausible ones.
 
     Attributes:
         begin: past the lip before the cup was tilted the last time [kg].
@@ -227,14 +228,12 @@ class PriorStream:
         flow: now [kg/s].
     """
 
-    def __init__(self, cup: CupFlow, belief: DoseBelief, *, slowest: bool) -> None:
+    def __init__(self, cup: CupFlow, belief: DoseBelief, *, less: float = 0.0, slowest: bool = False) -> None:
         self._cup = cup
-        self._volume, self._onset = float(belief.volume.mean()), float(belief.onset_bias.mean())
-        self._factor = median(belief.flow_factor)
+        self._volume = float(belief.volume.mean()) - less * float(belief.volume.std())
+        self._onset, self._factor = float(belief.onset_bias.mean()), median(belief.flow_factor)
         self._least = 1.5e-3  # [kg]
         if slowest:
-            self._volume -= 2.0 * float(belief.volume.std())
-        if slowest and belief.doses == 0:  # of a known cup, the usual onset and flow
             self._least = 2.5e-3
             self._onset += max(2.0 * float(belief.onset_bias.std()), LATEST_ONSET)
             self._factor *= 0.7
@@ -332,7 +331,8 @@ class DoseController:
         self._belief = belief
         self._readings = DoseReadings(belief.display, self._estimator.repeats, step=step, noise=noise)
         self._arm = CommandedArm(settings)
-        self._latest, self._usual = (PriorStream(cup, belief, slowest=slowest) for slowest in (True, False))
+        self._usual, self._known = PriorStream(cup, belief), PriorStream(cup, belief, less=2.0)
+        self._slowest = PriorStream(cup, belief, less=2.0, slowest=True)
         self._return_path = Return()
         self.phase = DosePhase.CHECK
         self.result: DoseResult | None = None
@@ -410,7 +410,7 @@ class DoseController:
             self._estimator.advance(time, tilt)
             if self.phase is not DosePhase.DONE and seconds > 0.0:
                 amount = float(self._estimator.mass.mean())
-                for stream in (self._latest, self._usual):
+                for stream in (self._usual, self._known, self._slowest):
                     stream.advance(seconds, tilt, amount)
                 if self.phase is not DosePhase.SETTLE:
                     self._departed = max(self._departed, amount)
@@ -575,11 +575,10 @@ class DoseController:
         self._before_silence = None
         # within one step of the display, the particles know more than it shows
         likely = min(max(float(self._estimator.mass.mean()), amount - step), amount + step)
-        missing = max(self._departed, self._latest.mass) - amount
+        missing = max(self._departed, self._slowest.mass) - amount
         flows_less = self._flows_less() and self._usual.lacks(amount)  # a film that surged has arrived all the same
-        # once in 700 doses a known cup poured 40 % less than usual; so it does not twice in one dose
-        share = 0.5 if self._belief.doses > 0 and self._pauses == 0 else 0.3
-        if self._suspected is not None and (flows_less or self._latest.lacks(amount, share=share)):
+        nothing = self._stream is self._known and self._known.lacks(amount, share=0.8)
+        if self._suspected is not None and (flows_less or nothing or self._slowest.lacks(amount)):
             self._end = self._end or self._suspected
             self._missing = max(missing, self._usual.mass - amount) if self._end is DoseEnd.STREAM_MISSED else 0.0
         smallest = max(self._settings.smallest_top_up, 1.5 * step)
@@ -594,8 +593,8 @@ class DoseController:
                 self._rising, self._doubt_since, self._suspected, self._paused = 0, None, None, False
                 self._doubted = False
                 self._unchanged_since, self._estimator.repeats.run = self._arm.now, 0.0
-                self._latest.restart(amount)
-                self._usual.restart(amount)
+                for stream in (self._usual, self._known, self._slowest):
+                    stream.restart(amount)
                 self._departed = amount
                 self._enter(DosePhase.APPROACH)
                 return
@@ -715,7 +714,7 @@ class DoseController:
     @property
     def _threshold(self) -> float:
         """Net reading above which liquid has arrived [kg]."""
-        return (self._latest.begin if self._top_ups else 0.0) + max(SEEN, 2.5 * self._readings.step)
+        return (self._slowest.begin if self._top_ups else 0.0) + max(SEEN, 2.5 * self._readings.step)
 
     def _begins_to_rise(self) -> bool:
         """Whether the last readings rise, faster than the particles flow and as slowly as a stream can.
@@ -735,7 +734,7 @@ class DoseController:
         if self.phase not in (DosePhase.APPROACH, DosePhase.POUR) or not self._readings:
             return
         assert self._begin is not None
-        readings, latest, now = self._readings, self._latest, self._arm.now
+        readings, stream, now = self._readings, self._stream, self._arm.now
         net = readings.net
         if self._silent():
             self._before_silence = net
@@ -750,11 +749,16 @@ class DoseController:
             self._pause(self._lost_stream())
         elif self._nearly_empty():
             self._turn_back(DoseEnd.SOURCE_EMPTY)
-        elif readings.rate() < 0.7 * max(latest.flow, 1e-3) and (
-            latest.lacks(net, SEEN_AFTER + readings.blind + median(self._estimator.lag))
+        elif readings.rate() < 0.7 * max(stream.flow, 1e-3) and (
+            stream.lacks(net, SEEN_AFTER + readings.blind + median(self._estimator.lag))
             or (self.phase is DosePhase.POUR and self._flows_less())
         ):
             self._pause(self._lost_stream())
+
+    @property
+    def _stream(self) -> PriorStream:
+        """The stream that readings must follow: of a known cup the usual one, until it was doubted in vain."""
+        return self._known if self._belief.doses > 0 and self._pauses == 0 else self._slowest
 
     def _flows_less(self) -> bool:
         """Whether far less flows than in the doses before."""
