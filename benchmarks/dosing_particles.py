@@ -7,7 +7,7 @@ The bench, its balance and its arm are those of benchmarks/dosing.py; cup, recei
 (`actors.dosing.particle_liquid`). Each series is five doses of 10 to 100 g (2 to 10 g in the row 'small amounts'),
 log-uniform, from a source that is 40 to 90 % full and is filled again when it holds too little. The receiver stands
 where the row's placement says; the grip's error is drawn as on the formula's bench. Development used the seeds below
-8000. The final ones begin at 8006: those before were used with earlier controllers.
+8000. The final ones begin at 8008: those before were used with earlier controllers.
 
 The run may be interrupted: `--into FILE` appends each finished series to a file as a line of JSON, and the next run
 with this file makes the others. The first series of all rows come first, then the second ones. `--json` writes the
@@ -55,7 +55,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from dosing import CUPS, OIL, PARTICLES, ROOT, cup_spec
 
 DATA = ROOT / "docs" / "data" / "dosing-particles.json"
-FIRST_SEED, FIRST_FINAL_SEED, SERIES, DOSES = 7000, 8006, 8, 5
+FIRST_SEED, FIRST_FINAL_SEED, SERIES, DOSES = 7000, 8008, 8, 5
 AMOUNTS, SMALL = (0.01, 0.1), (0.002, 0.01)
 FALL = 0.15
 GLYCEROL = {"name": "glycerol 50 %", "density": 1126.0, "dynamic_viscosity": 6e-3, "surface_tension": 0.068}
