@@ -245,6 +245,12 @@ class PriorStream:
         self.begin = self.mass = mass
         self._past.clear()
 
+    def begin_later(self, arrived: float) -> None:
+        """Shift the onset by the tilt that explains why only so much [kg] has arrived."""
+        # Δθ = ΔV / (−dV/dθ): what stands above the lip at a tilt flows out
+        lacking = max(self.mass - arrived, 0.0) / self._cup.density
+        self._onset += lacking / self._cup.volume_per_tilt(self._volume - self.mass / self._cup.density, 2e-3)
+
     def advance(self, seconds: float, tilt: float, amount: float) -> None:
         """Integrate it over a time [s] at a tilt [rad].
 
@@ -352,6 +358,7 @@ class DoseController:
         self._missing = 0.0  # of it, what has not arrived [kg]
         self._end: DoseEnd | None = None
         self._suspected: DoseEnd | None = None
+        self._lacked = 0.0  # by which a known cup's stream has been, when it was doubted [kg]
         self._paused = self._doubted = False
         self._top_ups = self._pauses = 0
 
@@ -577,9 +584,13 @@ class DoseController:
         likely = min(max(float(self._estimator.mass.mean()), amount - step), amount + step)
         missing = max(self._departed, self._slowest.mass) - amount
         flows_less = self._flows_less() and self._usual.lacks(amount)  # a film that surged has arrived all the same
-        nothing = self._stream is self._known and self._known.lacks(amount, share=0.8)
-        if self._suspected is not None and (flows_less or nothing or self._slowest.lacks(amount)):
-            self._end = self._end or self._suspected
+        # a known cup may begin later, and is behind once; a stream that misses in part is behind again
+        lacking = self._lacked + self._known.mass - amount
+        nothing = self._belief.doses > 0 and self._known.lacks(amount, share=0.8)
+        missed = self._suspected is not None and (flows_less or nothing or self._slowest.lacks(amount))
+        if missed or (self._lacked > 0.0 and lacking > max(2.5e-3, 0.3 * (amount + lacking))):
+            self._end = self._end or self._suspected or self._lost_stream()
+            missing = max(missing, lacking)
             self._missing = max(missing, self._usual.mass - amount) if self._end is DoseEnd.STREAM_MISSED else 0.0
         smallest = max(self._settings.smallest_top_up, 1.5 * step)
         if self._end is None and self._order.amount - likely > smallest:
@@ -590,6 +601,9 @@ class DoseController:
                 if self._doubted:
                     self._estimator.loosen()
                 self._estimator.update(DoseReading(self._arm.now, amount), sigma=max(0.05e-3, self.deviation))
+                if self._suspected is not None and self._belief.doses > 0:
+                    self._lacked += max(self._known.mass - amount, 0.0)
+                    self._known.begin_later(amount)
                 self._rising, self._doubt_since, self._suspected, self._paused = 0, None, None, False
                 self._doubted = False
                 self._unchanged_since, self._estimator.repeats.run = self._arm.now, 0.0
@@ -757,8 +771,8 @@ class DoseController:
 
     @property
     def _stream(self) -> PriorStream:
-        """The stream that readings must follow: of a known cup the usual one, until it was doubted in vain."""
-        return self._known if self._belief.doses > 0 and self._pauses == 0 else self._slowest
+        """The stream that readings must follow: of a known cup the usual one."""
+        return self._known if self._belief.doses > 0 else self._slowest
 
     def _flows_less(self) -> bool:
         """Whether far less flows than in the doses before."""
