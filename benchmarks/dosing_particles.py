@@ -55,7 +55,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from dosing import CUPS, OIL, PARTICLES, ROOT, cup_spec
 
 DATA = ROOT / "docs" / "data" / "dosing-particles.json"
-FIRST_SEED, FIRST_FINAL_SEED, SERIES, DOSES = 7000, 8008, 8, 5
+FIRST_SEED, FIRST_FINAL_SEED, SERIES, DOSES = 7000, 8006, 8, 5
 AMOUNTS, SMALL = (0.01, 0.1), (0.002, 0.01)
 FALL = 0.15
 GLYCEROL = {"name": "glycerol 50 %", "density": 1126.0, "dynamic_viscosity": 6e-3, "surface_tension": 0.068}

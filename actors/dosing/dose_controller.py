@@ -221,35 +221,29 @@ class PriorStream:
         belief: from the doses before.
         less: standard deviations by which the source holds less than expected.
         slowest: whether onset and flow are the slowest plausible ones.
+        least: mass by which a reading is behind at least, to be far behind [kg].
 
     Attributes:
-        begin: past the lip before the cup was tilted the last time [kg].
         mass: past the lip [kg].
         flow: now [kg/s].
     """
 
-    def __init__(self, cup: CupFlow, belief: DoseBelief, *, less: float = 0.0, slowest: bool = False) -> None:
-        self._cup = cup
+    def __init__(
+        self, cup: CupFlow, belief: DoseBelief, *, less: float = 0.0, slowest: bool = False, least: float = 2.5e-3
+    ) -> None:
+        self._cup, self._least = cup, least
         self._volume = float(belief.volume.mean()) - less * float(belief.volume.std())
         self._onset, self._factor = float(belief.onset_bias.mean()), median(belief.flow_factor)
-        self._least = 1.5e-3  # [kg]
         if slowest:
-            self._least = 2.5e-3
             self._onset += max(2.0 * float(belief.onset_bias.std()), LATEST_ONSET)
             self._factor *= 0.7
-        self.begin = self.mass = self.flow = self._time = 0.0
+        self.mass = self.flow = self._time = 0.0
         self._past: deque[tuple[float, float]] = deque(maxlen=100)  # times [s] and masses, the newest first
 
     def restart(self, mass: float) -> None:
         """So much [kg] has arrived, and nothing is on its way."""
-        self.begin = self.mass = mass
+        self.mass = mass
         self._past.clear()
-
-    def begin_later(self, arrived: float) -> None:
-        """Shift the onset by the tilt that explains why only so much [kg] has arrived."""
-        # Δθ = ΔV / (−dV/dθ): what stands above the lip at a tilt flows out
-        lacking = max(self.mass - arrived, 0.0) / self._cup.density
-        self._onset += lacking / self._cup.volume_per_tilt(self._volume - self.mass / self._cup.density, 2e-3)
 
     def advance(self, seconds: float, tilt: float, amount: float) -> None:
         """Integrate it over a time [s] at a tilt [rad].
@@ -337,7 +331,7 @@ class DoseController:
         self._belief = belief
         self._readings = DoseReadings(belief.display, self._estimator.repeats, step=step, noise=noise)
         self._arm = CommandedArm(settings)
-        self._usual, self._known = PriorStream(cup, belief), PriorStream(cup, belief, less=2.0)
+        self._usual, self._known = PriorStream(cup, belief), PriorStream(cup, belief, less=2.0, least=4e-3)
         self._slowest = PriorStream(cup, belief, less=2.0, slowest=True)
         self._return_path = Return()
         self.phase = DosePhase.CHECK
@@ -358,7 +352,6 @@ class DoseController:
         self._missing = 0.0  # of it, what has not arrived [kg]
         self._end: DoseEnd | None = None
         self._suspected: DoseEnd | None = None
-        self._lacked = 0.0  # by which a known cup's stream has been, when it was doubted [kg]
         self._paused = self._doubted = False
         self._top_ups = self._pauses = 0
 
@@ -584,13 +577,10 @@ class DoseController:
         likely = min(max(float(self._estimator.mass.mean()), amount - step), amount + step)
         missing = max(self._departed, self._slowest.mass) - amount
         flows_less = self._flows_less() and self._usual.lacks(amount)  # a film that surged has arrived all the same
-        # a known cup may begin later, and is behind once; a stream that misses in part is behind again
-        lacking = self._lacked + self._known.mass - amount
-        nothing = self._belief.doses > 0 and self._known.lacks(amount, share=0.8)
-        missed = self._suspected is not None and (flows_less or nothing or self._slowest.lacks(amount))
-        if missed or (self._lacked > 0.0 and lacking > max(2.5e-3, 0.3 * (amount + lacking))):
-            self._end = self._end or self._suspected or self._lost_stream()
-            missing = max(missing, lacking)
+        if self._suspected is not None and (
+            flows_less or self._slowest.lacks(amount) or self._nearly_all_lacks(amount)
+        ):
+            self._end = self._end or self._suspected
             self._missing = max(missing, self._usual.mass - amount) if self._end is DoseEnd.STREAM_MISSED else 0.0
         smallest = max(self._settings.smallest_top_up, 1.5 * step)
         if self._end is None and self._order.amount - likely > smallest:
@@ -601,9 +591,6 @@ class DoseController:
                 if self._doubted:
                     self._estimator.loosen()
                 self._estimator.update(DoseReading(self._arm.now, amount), sigma=max(0.05e-3, self.deviation))
-                if self._suspected is not None and self._belief.doses > 0:
-                    self._lacked += max(self._known.mass - amount, 0.0)
-                    self._known.begin_later(amount)
                 self._rising, self._doubt_since, self._suspected, self._paused = 0, None, None, False
                 self._doubted = False
                 self._unchanged_since, self._estimator.repeats.run = self._arm.now, 0.0
@@ -728,7 +715,7 @@ class DoseController:
     @property
     def _threshold(self) -> float:
         """Net reading above which liquid has arrived [kg]."""
-        return (self._slowest.begin if self._top_ups else 0.0) + max(SEEN, 2.5 * self._readings.step)
+        return (self._slowest.mass if self._top_ups else 0.0) + max(SEEN, 2.5 * self._readings.step)
 
     def _begins_to_rise(self) -> bool:
         """Whether the last readings rise, faster than the particles flow and as slowly as a stream can.
@@ -748,8 +735,7 @@ class DoseController:
         if self.phase not in (DosePhase.APPROACH, DosePhase.POUR) or not self._readings:
             return
         assert self._begin is not None
-        readings, stream, now = self._readings, self._stream, self._arm.now
-        net = readings.net
+        readings, now, net = self._readings, self._arm.now, self._readings.net
         if self._silent():
             self._before_silence = net
             self._pause()
@@ -763,16 +749,22 @@ class DoseController:
             self._pause(self._lost_stream())
         elif self._nearly_empty():
             self._turn_back(DoseEnd.SOURCE_EMPTY)
-        elif readings.rate() < 0.7 * max(stream.flow, 1e-3) and (
-            stream.lacks(net, SEEN_AFTER + readings.blind + median(self._estimator.lag))
-            or (self.phase is DosePhase.POUR and self._flows_less())
-        ):
+        elif self._falls_behind():
             self._pause(self._lost_stream())
 
-    @property
-    def _stream(self) -> PriorStream:
-        """The stream that readings must follow: of a known cup the usual one."""
-        return self._known if self._belief.doses > 0 else self._slowest
+    def _falls_behind(self) -> bool:
+        """Whether the readings are far behind the slowest plausible stream, or hardly follow the one of a known cup."""
+        readings, slowest, net = self._readings, self._slowest, self._readings.net
+        if readings.rate() < 0.5 * max(slowest.flow, 1e-3) and (
+            slowest.lacks(net + slowest.flow) or (self.phase is DosePhase.POUR and self._flows_less())
+        ):
+            return True
+        delay = SEEN_AFTER + readings.blind + median(self._estimator.lag)
+        return readings.rate() < 0.5 * self._known.flow and self._nearly_all_lacks(net, delay)
+
+    def _nearly_all_lacks(self, arrived: float, delay: float = 0.0) -> bool:
+        """Whether hardly anything arrived [kg] of the stream that a known cup has, before a delay [s]."""
+        return self._belief.doses > 0 and self._known.lacks(arrived, delay, share=0.8)
 
     def _flows_less(self) -> bool:
         """Whether far less flows than in the doses before."""
