@@ -7,7 +7,7 @@ The bench, its balance and its arm are those of benchmarks/dosing.py; cup, recei
 (`actors.dosing.particle_liquid`). Each series is five doses of 10 to 100 g (2 to 10 g in the row 'small amounts'),
 log-uniform, from a source that is 40 to 90 % full and is filled again when it holds too little. The receiver stands
 where the row's placement says; the grip's error is drawn as on the formula's bench. Development used the seeds below
-8000. The final ones begin at 8008: those before were used with earlier controllers.
+8000. The final ones begin at 8006; 8007 showed a defect, which was cured, and does not count.
 
 The run may be interrupted: `--into FILE` appends each finished series to a file as a line of JSON, and the next run
 with this file makes the others. The first series of all rows come first, then the second ones. `--json` writes the

@@ -322,8 +322,9 @@ class DoseController:
         in_time: bool = False,
     ) -> None:
         self._cup, self._order, self._settings, self._in_time = cup, order, settings, in_time
-        # what arrives late is a film of the last flow, which is slower in a small dose
-        self._share = min(order.amount / FINE_TIME / settings.largest_fine_flow, 1.0)
+        # what arrives late is a film of the last flow, which is slower in a small dose, see `fine_flow`
+        last = min(max(order.amount / FINE_TIME, settings.smallest_flow), settings.largest_fine_flow)
+        self._share = last / settings.largest_fine_flow
         estimated = replace(belief, aim=self._share * belief.aim)
         self._estimator = DoseEstimator(
             cup, estimated, fall_time=fall_time, step=step, noise=noise, rng=np.random.default_rng((seed, 5))
