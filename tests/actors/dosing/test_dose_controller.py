@@ -431,7 +431,7 @@ def test_a_receiver_that_was_moved_is_noticed_in_the_next_dose_and_what_is_known
 
 
 def test_a_known_cup_with_less_than_was_stated_pours_its_dose() -> None:
-    """Its content is 30 g less, stated with a standard deviation of 15 g: it pours later than usual."""
+    """Its content is 40 g less, stated with a standard deviation of 20 g: it pours later than usual."""
     bench = VirtualDosingBench(SPOUTED, WATER, TrueScale(lag=0.3), 1)
     series = DoseSeries(CUP, DosingSettings(), SourceContent(0.3), bench.place_receiver(), np.random.default_rng(1))
     for seed in (1, 2):
@@ -440,8 +440,8 @@ def test_a_known_cup_with_less_than_was_stated_pours_its_dose() -> None:
         record = bench.dose(controller)
         assert controller.result is not None
         series.finish(controller.result)
-        bench.refill(0.27)
-        series.fill(SourceContent(0.3, 0.015))
+        bench.refill(0.26)
+        series.fill(SourceContent(0.3, 0.02))
     assert controller.result.end is DoseEnd.REACHED
     assert record.spilled < 5e-3
 
