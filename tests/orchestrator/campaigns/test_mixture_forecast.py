@@ -107,7 +107,7 @@ def test_vessels_places_and_amounts_that_are_impossible_are_refused_at_once(
         "{name: bench, mode: virtual, bench: {liquid: {particles: 400}, operator_time: 60 s}}", str(RACK)
     )
     text = text.replace("floor: 4 mm}}", "floor: 4 mm}, grip: {mass: 1400 g}}").replace(
-        "ethanol: 1.01 g}\n    A2"
+        "ethanol: 20 g}\n    A2", "ethanol: 1.01 g}\n    A2"
     )
     path = tmp_path / "mix.yaml"
     path.write_text(text, encoding="utf-8")
