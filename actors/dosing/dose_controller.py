@@ -105,6 +105,17 @@ def fine_flow(
     return min(max(min(clean, seen, amount / FINE_TIME), settings.smallest_flow), settings.largest_fine_flow)
 
 
+def late_share(amount: float, settings: DosingSettings) -> float:
+    """Share of `DoseBelief.aim` that a dose expects: a film of its last flow, which is slower in a small dose.
+
+    Args:
+        amount: of the dose [kg].
+        settings: of the dose.
+    """
+    last = min(max(amount / FINE_TIME, settings.smallest_flow), settings.largest_fine_flow)
+    return last / settings.largest_fine_flow
+
+
 def unseen(flow: float, interval: float) -> float:
     """Amount [kg] within which a flow [kg/s] is known between two readings with an interval [s], with 95 %."""
     return 2.0 * FLOW_ERROR * flow * interval / math.sqrt(3.0)
@@ -322,9 +333,7 @@ class DoseController:
         in_time: bool = False,
     ) -> None:
         self._cup, self._order, self._settings, self._in_time = cup, order, settings, in_time
-        # what arrives late is a film of the last flow, which is slower in a small dose, see `fine_flow`
-        last = min(max(order.amount / FINE_TIME, settings.smallest_flow), settings.largest_fine_flow)
-        self._share = last / settings.largest_fine_flow
+        self._share = late_share(order.amount, settings)
         estimated = replace(belief, aim=self._share * belief.aim)
         self._estimator = DoseEstimator(
             cup, estimated, fall_time=fall_time, step=step, noise=noise, rng=np.random.default_rng((seed, 5))
@@ -610,7 +619,7 @@ class DoseController:
 
     def _finish(self, end: DoseEnd, *, known: bool, amount: float = 0.0) -> None:
         self.phase = DosePhase.DONE
-        aim = self._aim() / self._share
+        aim = self._aim() / self._share if self._missing == 0.0 else self._belief.aim
         if self._expected is not None and known and end in (DoseEnd.REACHED, DoseEnd.MISSED):
             # aim += max(1/4, 1/(n + 2)) s (late − s aim), s the share: mean of the doses so far, later an exponential
             # average

@@ -26,6 +26,7 @@ from actors.dosing.dose_controller import (
     DoseResult,
     check_display,
     fine_flow,
+    late_share,
 )
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, draw_lags
 from actors.dosing_settings import DosingSettings
@@ -176,11 +177,12 @@ class DoseSeries:
         """
         rng = np.random.default_rng((seed, 23))
         widened = self.belief.widened(rng)
+        share = late_share(order.amount, self._settings)
         amounts, durations, ends = [], [], Counter[DoseEnd]()
         for k, chosen in enumerate(rng.permutation(len(widened.volume))[:count]):
             truth = DoseEstimator(
                 self._cup,
-                _single(widened, int(chosen)),
+                replace(_single(widened, int(chosen)), aim=share * widened.aim),
                 fall_time=self._fall_time,
                 step=self._step,
                 noise=0.0,

@@ -23,7 +23,14 @@ from actors.dosing.dose_controller import (
     check_display,
     fine_flow,
 )
-from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, calibrated_knowledge, draw_lags
+from actors.dosing.dose_estimator import (
+    FIRST_AIM,
+    DoseBelief,
+    DoseEstimator,
+    DoseReading,
+    calibrated_knowledge,
+    draw_lags,
+)
 from actors.dosing.dose_series import DoseSeries, SourceContent, after_dose
 from actors.dosing.tilt_command import TiltCommand
 from actors.dosing.virtual_dosing_bench import (
@@ -374,6 +381,8 @@ def test_a_stream_beside_the_receiver_is_stopped() -> None:
     record, controller = one_dose(0.1, DosingFault("miss", 0.0))
     assert controller.result is not None
     assert controller.result.end is DoseEnd.STREAM_MISSED
+    after = controller.result.belief  # nothing was learned of what arrives late, and the next dose is the first one
+    assert (after.doses, after.aim) == (0, FIRST_AIM)
     assert record.spilled < 0.08  # before the first dose the onset is known to 1.2° only, 8 g per degree
 
 
