@@ -113,7 +113,7 @@ class RtdeClient:
         self._commands = int(time.monotonic() * 1e3) % 1_000_000  # not the number that an earlier client wrote last
         self._silence = silence
         self._last: DataPackage | None = None
-        self._changed = clock.now
+        self._changed, self._changed_to = clock.now, self._outputs.latest()[1]["timestamp"][0]
         self._same_readings = 0
 
     # ---- reading
@@ -138,7 +138,7 @@ class RtdeClient:
             if self._same_readings >= _SAME_READINGS and self.clock.now - self._changed > silences * self._silence:
                 raise TroubleError("lost", f"the controller has said nothing new for {silences * self._silence:g} s")
             return last
-        self._same_readings, self._changed = 0, self.clock.now
+        self._same_readings, self._changed, self._changed_to = 0, self.clock.now, values["timestamp"][0]
         self._last = DataPackage(
             time=values["timestamp"][0],
             seen=seen,
@@ -170,9 +170,10 @@ class RtdeClient:
 
         The library closes its connection for good after 2.5 s of wall time without a package, also if the emulator or
         its own thread was given no processor. A cut connection ends the writer's as well, and a controller that says
-        nothing lets the clock go on.
+        nothing lets the clock go on. Packages have come since the last look, which may be minutes ago.
         """
-        stood = self.clock.now - self._changed <= silences * self._silence
+        heard = self._changed + max(self._outputs.latest()[1]["timestamp"][0] - self._changed_to, 0.0)
+        stood = self.clock.now - heard <= silences * self._silence
         return isinstance(self.clock, SharedClock) and stood and not self._inputs.lost
 
     def fresh(self) -> DataPackage:

@@ -25,7 +25,7 @@ import pytest
 
 from actors.arm.arm_interface import ArmError, ArmLostError, ArmNotReleasedError, ArmRefusedError, ArmStoppedError
 from actors.arm.planned_pour import JointPath
-from actors.arm.ur import rtde
+from actors.arm.ur import rtde, worker_messages
 from actors.arm.ur.rtde_client import has_library
 from actors.arm.ur.ur_driver import UrArm
 from actors.arm.ur.urscript_writer import path_program
@@ -87,6 +87,12 @@ def answers(rig: Rig) -> bool:
     return True
 
 
+def connections(rig: Rig) -> set[int]:
+    """Ports of the worker's connections for RTDE."""
+    found = psutil.Process(rig.worker).net_connections()
+    return {one.laddr.port for one in found if one.raddr and one.raddr.port == rtde.PORT}
+
+
 # ---- lines
 
 
@@ -119,20 +125,30 @@ def test_a_pour_is_completed_though_the_library_gave_up_on_a_late_host(
     rig = make_rig(LONG_TILT, time_scale=FASTER, clock=str(tmp_path / "clock"))
     pouring = rig.pouring()
     rig.await_tilt(0.15)
-    worker = psutil.Process(rig.worker)
-
-    def connections() -> set[int]:
-        return {c.laddr.port for c in worker.net_connections() if c.raddr and c.raddr.port == rtde.PORT}
-
-    before = connections()
+    before = connections(rig)
     stopped = rig.controller.pid if late == "controller" else rig.worker
     os.kill(stopped, signal.SIGSTOP)
     if late == "controller":
-        rig.await_that(lambda: not before <= connections(), "the library's end of the connection")
+        rig.await_that(lambda: not before <= connections(rig), "the library's end of the connection")
     else:
         time.sleep(3.5)  # more than the 2.5 s after which the library gives up, also where its own thread was stopped
     os.kill(stopped, signal.SIGCONT)
     assert pouring.result() is not None
+    assert rig.joints == pytest.approx(START, abs=1e-3)
+
+
+@pytest.mark.realtime
+@pytest.mark.skipif(not has_library(), reason="without ur-rtde, nothing gives up")
+def test_an_arm_that_nobody_looked_at_for_long_moves_though_the_library_gave_up_on_a_late_host(
+    make_rig: Make, tmp_path: Path
+) -> None:
+    rig = make_rig(LONG_TILT, time_scale=FASTER, clock=str(tmp_path / "clock"))
+    rig.await_time(rig.now + 100.0 * worker_messages.SILENCE)  # as while kernels for a dose are compiled
+    before = connections(rig)
+    os.kill(rig.controller.pid, signal.SIGSTOP)
+    rig.await_that(lambda: not before <= connections(rig), "the library's end of the connection")
+    os.kill(rig.controller.pid, signal.SIGCONT)
+    assert rig.pouring().result() is not None
     assert rig.joints == pytest.approx(START, abs=1e-3)
 
 
