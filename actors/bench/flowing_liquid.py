@@ -223,7 +223,7 @@ class FlowingLiquid:
             LaboratoryError: the liquid could not be simulated.
         """
         self._ending.set()
-        self._thread.join(SILENCE)
+        self._thread.join()  # however long its step takes: what simulates particles is for one thread at a time
         with contextlib.suppress(LaboratoryError):
             self._follow()
         if self._problem is not None:

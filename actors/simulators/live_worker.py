@@ -75,8 +75,10 @@ class LivePourProcess:
             reply = child.connection.recv()
         except (EOFError, OSError):
             self._child = None
-            child.close()
+            child.connection.close()
+            child.wait(ENDING)
             problem = last_lines(child.errors_kept) or f"status {child.status}"
+            child.close()
             raise LaboratoryError(f"the process that simulates the liquid of doses has died: {problem}") from None
         if isinstance(reply, Exception):
             raise reply

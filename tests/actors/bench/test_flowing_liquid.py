@@ -233,3 +233,30 @@ def test_a_simulation_that_fails_ends_the_flow_with_its_reason(monkeypatch: pyte
     assert not liquid._thread.is_alive()
     with pytest.raises(LaboratoryError, match="could not be simulated: particles crossed vessel walls"):
         liquid.end()
+
+
+class SlowDrips(Drips):
+    """Its first step ends when another one begins next to it, or when none does for a while."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun, self.next, self.overlapped = threading.Event(), threading.Event(), False
+
+    def advance(self, times: NDArray[np.float64], poses: NDArray[np.float64]) -> LiveState:
+        if self.begun.is_set():
+            self.next.set()
+        else:
+            self.begun.set()
+            self.overlapped = self.next.wait(0.5)  # a second step would begin at once
+        return super().advance(times, poses)
+
+
+def test_the_end_waits_for_a_step_that_takes_long_and_makes_none_next_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flowing_liquid, "SILENCE", 0.0)
+    drips = SlowDrips()
+    liquid = tilted(monkeypatch, drips, lambda mass: None, on_tray=False)
+    assert drips.begun.wait(PATIENCE)
+    end = liquid.end()
+    liquid._thread.join(PATIENCE)
+    assert not drips.overlapped
+    assert end.received + end.spilled > 0.0

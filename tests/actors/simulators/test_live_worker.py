@@ -82,6 +82,11 @@ def test_after_the_process_was_killed_the_next_pour_has_a_new_one(
     assert pours.advance(path.times[1:], path.poses[1:]).in_pourer < 0.3
 
 
+def test_the_end_of_the_process_is_reported_with_its_last_messages(pours: LivePourProcess) -> None:
+    with pytest.raises(LaboratoryError, match=r"has died: .*AttributeError: .*scene"):
+        pours.begin("no task", np.zeros(7))  # type: ignore[arg-type]
+
+
 @pytest.mark.slow
 def test_an_impossible_pour_is_refused_and_the_process_goes_on(pours: LivePourProcess) -> None:
     clings = SimulationParameters(particles=200, lip_adhesion=1.0)
