@@ -39,8 +39,12 @@ LONGEST = 3 * 3600.0
 
 @contextlib.contextmanager
 def busy_processes(count: int) -> Iterator[None]:
-    """Keep processes busy while the body runs; they end with this process, also when it is killed."""
-    children = [started([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    """Keep processes busy while the body runs; they end with this process, also when it is killed.
+
+    Each has a session of its own: Linux may give all processes of a session together the share of one (`autogroup`).
+    """
+    command = [sys.executable, "-c", "while True: pass"]
+    children = [started(command, start_new_session=True) for _ in range(count)]
     try:
         yield
     finally:
