@@ -142,8 +142,8 @@ def test_a_pour_is_completed_though_the_library_gave_up_on_a_late_host(
 def test_an_arm_that_nobody_looked_at_for_long_moves_though_the_library_gave_up_on_a_late_host(
     make_rig: Make, tmp_path: Path
 ) -> None:
-    rig = make_rig(LONG_TILT, time_scale=FASTER, clock=str(tmp_path / "clock"))
-    rig.await_time(rig.now + 100.0 * worker_messages.SILENCE)  # as while kernels for a dose are compiled
+    rig = make_rig(pour_path(hold=0.1), time_scale=FASTER, clock=str(tmp_path / "clock"))
+    rig.await_time(rig.now + 250.0 * worker_messages.SILENCE)  # as while kernels for a dose are compiled
     before = connections(rig)
     os.kill(rig.controller.pid, signal.SIGSTOP)
     rig.await_that(lambda: not before <= connections(rig), "the library's end of the connection")
