@@ -170,7 +170,8 @@ class RtdeClient:
 
         The library closes its connection for good after 2.5 s of wall time without a package, also if the emulator or
         its own thread was given no processor. A cut connection ends the writer's as well, and a controller that says
-        nothing lets the clock go on. Packages have come since the last look, which may be minutes ago.
+        nothing lets the clock go on. Packages have come since the last look, which may be minutes ago; the controller's
+        time, by which their last one is dated, goes at least as fast as the clock.
         """
         heard = self._changed + max(self._outputs.latest()[1]["timestamp"][0] - self._changed_to, 0.0)
         stood = self.clock.now - heard <= silences * self._silence
