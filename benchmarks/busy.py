@@ -5,8 +5,7 @@
 
 - `quickstart`: the README's campaign.
 - `night`: mixtures.yaml on rack.yaml, where an arm carries the vessels of six cups.
-- `series`: the doses of dispense.yaml on virtual-dosing.yaml, in real time; a dose that misses its tolerance makes it
-  end with 4.
+- `series`: the doses of dispense.yaml on virtual-dosing.yaml, in real time.
 
 The busy processes have normal priority, run on the same cores, and end with this process. `--one-core` keeps
 everything on the first permitted core. Each run's exit code and time are printed; the time is not judged. The exit
