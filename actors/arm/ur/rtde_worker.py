@@ -10,6 +10,7 @@ import contextlib
 import faulthandler
 import os
 import queue
+import select
 import sys
 import threading
 from multiprocessing.connection import Connection
@@ -99,7 +100,9 @@ class Worker:
                 os._exit(0)
 
     def _report(self, progress: MotionProgress) -> None:
-        self._send(progress)
+        # a driver that reads nothing, such as a suspended program's, must not delay the heartbeat of a motion
+        if select.select([], [self._connection], [], 0.0)[1]:
+            self._send(progress)
 
     # ---- requests
 
