@@ -74,6 +74,9 @@ READINGS_PLACED, LONGEST_INTERVAL = 4, 5.0
 LIGHTEST_RECEIVER = 5e-3
 """Smallest rise of the reading that counts as a receiver [kg]."""
 
+SOON = 4.0
+"""Time within which the process that simulates a liquid starts if its kernels are in the cache [s]."""
+
 CLOSING_TIME = 60.0
 """Time of a dose beyond its limit, for settling, top-ups and the return [s]."""
 
@@ -137,7 +140,7 @@ class DoseProcedure(BenchProcedure):
         names = None if setup.doses is None else setup.doses.names(self._scene, self._dose)
         if setup.doses is None:
             await self._refill()
-        await setup.ground_truth.prepare_dose(self._scene, self._dose, self._seed, names)
+        await self._prepare_liquid(names)
         carried: dict[str, Any] = {}
         async with self._readings.running():
             if setup.doses is not None:
@@ -155,6 +158,20 @@ class DoseProcedure(BenchProcedure):
                 carried = await self._finish(setup.doses, (result.amount, result.deviation), lost_by(result))
         self._report.enter("record", 1.0)
         return self._measurement(result, {**carried, **truth})
+
+    async def _prepare_liquid(self, names: tuple[str, str] | None) -> None:
+        """Let a virtual bench prepare what it pours, and tell if that takes long: the arm does not move meanwhile."""
+        setup = self._setup
+        preparing = asyncio.create_task(
+            setup.ground_truth.prepare_dose(self._scene, self._dose, self._seed, names), name="liquid"
+        )
+        try:
+            if (await asyncio.wait({preparing}, timeout=SOON))[1]:
+                text = "preparing the simulation of the liquid; it is compiled the first time, which takes minutes"
+                setup.tell(Notice("info", text))
+            await preparing
+        finally:
+            preparing.cancel()
 
     async def _finish(
         self, handling: DoseHandling, amount: tuple[float, float], lost: tuple[float, float]

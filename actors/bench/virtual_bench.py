@@ -179,6 +179,10 @@ class BenchEmulators:
         self._arm_emulator.fault("pace", {"scale": scale})
         self.order("pace", {"scale": scale})
 
+    def ready(self, task: PourTask) -> None:
+        """Start the process that simulates the particles of doses, if it does not run; nothing flows."""
+        self._pours.ready(task)
+
     def flow(self, order: FlowOrder) -> None:
         """Let liquid follow the arm from now on; the load on the balance follows it.
 
@@ -288,6 +292,10 @@ class DeviceEmulators:
     async def pace(self, time_scale: float) -> None:
         """Set the bench seconds per second of the clock of arm and balance."""
         await self.device.call("pace", time_scale, deadline=DEADLINE, urgent=True)
+
+    async def ready(self, task: PourTask) -> None:
+        """See `BenchEmulators.ready`; takes minutes where kernels are compiled."""
+        await self.device.call("ready", task, deadline=10.0 * DEADLINE)
 
     async def flow(self, order: FlowOrder) -> None:
         """Let liquid follow the arm."""
@@ -543,6 +551,7 @@ class FollowedBench(VirtualBench):
             contents.dry.setdefault(name, contents.dry[usual] if mass is None else mass)
         if self._spec.doses == "particles":
             check_particles(scene, dose.amount, self._spec.theta)
+            await self.emulators.ready(self._particles(scene, source.mass, seed))
         volume = vessel(scene.pourer).capacity if self._spec.doses == "particles" else true_cup(scene).capacity
         held = source.mass + source.deviation * float(np.random.default_rng((seed, 51)).standard_normal())
         if carried is None and (source.fill or self.contents.in_pourer <= 0.0):
@@ -586,7 +595,7 @@ class FollowedBench(VirtualBench):
         error, content = draw_pose_error(self._spec, seed), self.contents.in_pourer
         liquid: FormulaLiquid | PourTask
         if self._spec.doses == "particles":
-            liquid = dose_task(scene, FOLLOWED, content, self._spec.theta, error, liquid_seed(seed))
+            liquid = self._particles(scene, content, seed)
         else:
             wetness = 0.0 if source.unused else 0.2 if source.fill else 0.7
             filled = scene.liquid.model_copy(update={"mass": content})
@@ -597,6 +606,10 @@ class FollowedBench(VirtualBench):
         self._flowing = True
         if show is not None and watched:
             self._showing = asyncio.create_task(self._show(show))
+
+    def _particles(self, scene: Scene, content: float, seed: int) -> PourTask:
+        error = draw_pose_error(self._spec, seed)
+        return dose_task(scene, FOLLOWED, content, self._spec.theta, error, liquid_seed(seed))
 
     async def _show(self, show: Callable[[RecordedFrames], None]) -> None:
         while True:

@@ -44,8 +44,17 @@ class LivePourProcess:
     def __init__(self) -> None:
         self._child: ConnectedProcess | None = None
 
+    def ready(self, task: PourTask) -> None:
+        """Start the process and its kernels, so that `begin` takes seconds: minutes if they have to be compiled."""
+        if self._child is not None:
+            with contextlib.suppress(LaboratoryError):  # it was killed between two pours
+                self._call("ready", task)
+                return
+        self._child = self._child or ConnectedProcess(__name__)
+        self._call("ready", task)
+
     def begin(self, task: PourTask, pose: Floats) -> None:
-        """See `LivePours.begin`; the first call takes seconds, and a minute if the kernels have to be compiled."""
+        """See `LivePours.begin`."""
         self._child = self._child or ConnectedProcess(__name__)
         self._call("begin", task, pose)
 
@@ -99,16 +108,17 @@ class LocalLivePours:
 
     def begin(self, task: PourTask, pose: Floats) -> None:
         """See `LivePours.begin`."""
-        if task.scene.liquid.is_thick not in self._compiled:
-            self._compile(task)
+        self.ready(task)
         poses = in_plane(np.array([pose, pose]))
         mirrored = poses is not None and self._simulator.mirrors(task, SampledMotion(np.array([0.0, 1.0]), poses))
         self._pour = LivePour(self._simulator, task, pose, mirrored=mirrored)
 
-    def _compile(self, task: PourTask) -> None:
+    def ready(self, task: PourTask) -> None:
         """Compile the kernels, or load them from the cache; like `JobRunner`, write those that were compiled."""
         from sim_engine.engine_package import compiling_alone
 
+        if task.scene.liquid.is_thick in self._compiled:
+            return
         begun = time.process_time()
         with compiling_alone(lambda: False):
             LivePour(self._simulator, task, SIDEWAYS).advance(np.array([WARM_UP]), SIDEWAYS)

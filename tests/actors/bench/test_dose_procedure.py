@@ -28,9 +28,10 @@ import pytest
 from actors.arm.planning.kinematics import pourer_motion
 from actors.arm.ur_settings import UrArmSettings
 from actors.balance.balance_settings import SerialBalanceSettings
+from actors.bench import dose_procedure
 from actors.bench.dose_procedure import DoseProcedure
 from actors.bench.virtual_bench import BenchEmulators
-from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, PourProgress, UnknownPourError
+from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, Notice, PourProgress, UnknownPourError
 from actors.laboratory_settings import LaboratorySettings, TrueLiquid
 from actors.liquid_devices import SimulatedPumpSettings, SourceSettings
 from actors.runtime.child_process import child_environment
@@ -148,6 +149,11 @@ async def test_particles_are_poured_over_the_wires_and_the_source_keeps_the_rest
     seen: list[PourProgress] = []
     left, on_tray = 0.35, 0.0
     async with open_stage(spec) as stage:
+
+        async def starts() -> None:
+            assert stage.site.device._object._pours._child is not None  # type: ignore[attr-defined]
+
+        stage.before["start"] = starts  # minutes of compiling do not pass over a tilted cup
         for grams, fill in ((60.0, True), (40.0, False)):
             source = DoseSource("beaker", left, 5e-4, fill=fill, constants=11)
             dose = DoseTarget(1e-3 * grams, 1e-3, "A1", source)
@@ -238,6 +244,25 @@ async def test_a_receiver_settles_by_the_clock_of_the_bench_if_that_is_slower_th
     procedure._readings.all += [1.0, 2.0]
     await waiting
     assert procedure._now() >= 0.1
+
+
+async def test_a_liquid_whose_simulation_is_compiled_is_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dose_procedure, "SOON", 0.01)
+    told, compiled = [], asyncio.Event()
+
+    async def prepare_dose(*dose: object) -> None:
+        await compiled.wait()
+
+    def tell(notice: Notice) -> None:
+        told.append(notice.text)
+        compiled.set()
+
+    procedure: Any = object.__new__(DoseProcedure)
+    procedure._scene = procedure._dose = procedure._seed = None
+    procedure._setup = SimpleNamespace(ground_truth=SimpleNamespace(prepare_dose=prepare_dose), tell=tell)
+    for _ in range(2):
+        await procedure._prepare_liquid(None)
+    assert [text.split(";")[0] for text in told] == ["preparing the simulation of the liquid"]
 
 
 @pytest.mark.slow

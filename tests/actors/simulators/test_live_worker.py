@@ -71,8 +71,11 @@ def test_after_the_process_was_killed_the_next_pour_has_a_new_one(
     pours: LivePourProcess, simulator: PourSimulator
 ) -> None:
     path = motion(simulator)
-    pours.begin(TASK, path.poses[0])
+    pours.ready(TASK)
     assert pours._child is not None
+    os.kill(pours._child.pid, signal.SIGKILL)
+    pours.ready(TASK)
+    pours.begin(TASK, path.poses[0])
     os.kill(pours._child.pid, signal.SIGKILL)
     with pytest.raises(LaboratoryError, match="simulates the liquid of doses has died"):
         pours.advance(path.times[1:], path.poses[1:])
