@@ -17,7 +17,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from actors.dosing.dose_series import NINETY_PERCENT
-from actors.interfaces import DoseKnowledge, DoseSource, DoseTarget
+from actors.interfaces import DoseEnd, DoseKnowledge, DoseSource, DoseTarget
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.learning.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.learning.stage_result import (
@@ -39,6 +39,10 @@ WEIGHED_DEVIATION = 0.3e-3
 
 ENOUGH = 3.0
 """Standard deviations of the content by which a source has to hold more than the amount."""
+
+MISSED_STREAMS = 2
+"""Doses in a row whose stream missed the receiver, after which nothing more is poured: the first one may be its cup's,
+the second one shows that something was moved for all that follow."""
 
 
 class KnownSource(ResultPart):
@@ -418,8 +422,16 @@ class Dispense:
         """Whether all doses are completed."""
         return self._pouring is None and self._next() is None
 
+    @property
+    def _stopped(self) -> bool:
+        """Whether the last doses missed the receiver, so that the next one would pour onto the table."""
+        last = self._doses[-MISSED_STREAMS:]
+        return len(last) == MISSED_STREAMS and all(dose.end == DoseEnd.STREAM_MISSED for dose in last)
+
     def _next(self) -> PlannedDose | None:
         """The dose after the completed ones; None if there is none."""
+        if self._stopped:
+            return None
         return self._plan.doses[len(self._doses)] if len(self._doses) < len(self._plan.doses) else None
 
     def _in_cup(self, target: DoseTarget) -> DoseTarget:
@@ -538,6 +550,12 @@ class Dispense:
         )
         self._doses.append(dose)
         self._settle(dose)
+        if self._stopped:
+            text = (
+                f"nothing more is poured: the streams of {MISSED_STREAMS} doses in a row missed the receiver. See "
+                "where receiver and source stand before you start another run"
+            )
+            self.decisions.append(Decision(text, urgent=True))
 
     def _settle(self, dose: Dose) -> None:
         """Decide what follows from a completed dose."""

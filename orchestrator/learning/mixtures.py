@@ -101,6 +101,8 @@ class Mix(Dispense):
         self._free, self._refused = list(plan.mixtures.proposals or ()), ""
 
     def _next(self) -> PlannedDose | None:
+        if self._stopped:
+            return None
         return next((self._remaining[cup.position][0] for cup in self._cups if self._open(cup)), None)
 
     def _open(self, cup: MixedCup) -> bool:
@@ -131,7 +133,7 @@ class Mix(Dispense):
         """What has to be decided before the next dose; None: nothing."""
         if self._miss is not None:
             return self._miss[2]
-        if not self._free or self._pouring is not None or self._next() is not None:
+        if self._stopped or not self._free or self._pouring is not None or self._next() is not None:
             return None
         text = f"Which mixtures are poured next, into at most {len(self._free)} cups ({', '.join(self._free)})? "
         text += (
@@ -232,7 +234,7 @@ class Mix(Dispense):
                 state = "unknown"
                 self._say(f"{cup.position}: its content is UNKNOWN, nothing more is poured into it", urgent=True)
         self._cups[index] = cup.model_copy(update={"state": state})
-        if dose.outcome == "missed":
+        if dose.outcome == "missed" and not self._stopped:
             policy = self._mixtures.on_miss
             self._decide(index, dose, "correct" if policy == "accept" else policy)
 

@@ -237,9 +237,11 @@ def _reason(pour: RunPour) -> str:
         return "it had begun, and its outcome is not known"
     received = weighed_masses(pour.measured).delivered_g or 0.0
     source = f" from {dose.source.name}" if dose.source is not None else ""
+    end = pour.measured.notes.get("dose", {}).get("end", "")
+    cause = "" if end in ("", "reached", "missed", "short") else f"{end}: "
     beyond = abs(received - 1e3 * dose.amount) - 1e3 * dose.limit
     return (
-        f"{received:.2f} g received of {1e3 * dose.amount:g} g{source}, {beyond:.2f} g beyond the tolerance of "
+        f"{cause}{received:.2f} g received of {1e3 * dose.amount:g} g{source}, {beyond:.2f} g beyond the tolerance of "
         f"{1e3 * dose.limit:g} g"
     )
 

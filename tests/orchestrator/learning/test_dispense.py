@@ -30,6 +30,7 @@ from tests.support import plans
 
 ACTION = Action(1.0, 0.09, 0.06)
 TUMBLER = cylinder("tumbler", inner_radius=0.03, inner_height=0.09)
+MISSES = "stream misses the receiver"
 KNOWLEDGE = {"onset_flow": [0.01, 0.0], "covariance": [1e-4, 0.0, 0.0, 0.04], "lag": None, "aim": 3e-4, "doses": 1}
 
 
@@ -86,13 +87,29 @@ def test_a_spilled_mass_that_nobody_weighed_is_unknown_and_not_zero() -> None:
 def test_a_stream_that_misses_is_stated_with_its_missing_mass_wherever_the_dose_is_told() -> None:
     strategy = Dispense(plan(50), seed=5)
     pour = asked(strategy)
-    end = "stream misses the receiver"
+    end = MISSES
     strategy.tell(pour, poured(pour, 2.1, end=end, missing=None, missing_mass=7.8e-3, deviation=1e-4, spilled=None))
     (dose,) = strategy.result().doses
     assert (dose.missing_g, dose.end_text) == (pytest.approx(7.8), f"{end}: about 8 g of it")
     assert dose.end_text in dose_text(dose)
     (row,) = _dose_table("doses", strategy.result()).rows
     assert dose.end_text in row.cells[-1]
+
+
+@pytest.mark.parametrize(
+    ("ends", "poured_doses"),
+    [("mmrr", 2), ("rmmr", 3), ("mrmr", 4), ("rrmm", 4)],
+    ids=["at once", "moved later", "not in a row", "at the end"],
+)
+def test_nothing_is_poured_after_two_streams_in_a_row_that_missed(ends: str, poured_doses: int) -> None:
+    strategy = Dispense(plan(50, 50, 50, 50, refill_below=0.0), seed=5)
+    while not strategy.finished:
+        pour = asked(strategy)
+        missed = ends[pour.number - 1] == "m"
+        strategy.tell(pour, poured(pour, 2.0 if missed else 50.0, end=MISSES if missed else "reached"))
+    assert len(strategy.result().doses) == poured_doses
+    stopped = [decision for decision in strategy.decisions if "nothing more is poured" in decision.text]
+    assert [decision.urgent for decision in stopped] == ([True] if ends[:poured_doses].endswith("mm") else [])
 
 
 def test_a_dose_knows_what_the_earlier_ones_have_shown_and_left() -> None:

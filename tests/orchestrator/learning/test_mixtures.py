@@ -101,6 +101,23 @@ def test_a_missed_mixture_is_poured_again_into_a_spare_cup() -> None:
     assert any("no spare cup is left" in decision.text for decision in strategy.decisions)
 
 
+@pytest.mark.parametrize("policy", ["repeat", "ask", "correct"])
+def test_no_cup_gets_anything_after_two_streams_in_a_row_that_missed(policy: str) -> None:
+    strategy = Mix(plan(*TWO, on_miss=policy, spares=("rack/D6",), proposals=("rack/B1",)), 5)
+    for _ in range(2):
+        if question := strategy._question:
+            strategy.ask(Slots(0))
+            strategy.tell(question, Answered("accept"))
+        pour, _ = asked(strategy)
+        answer = poured(pour, 1.0)
+        answer.measurement.notes["dose"]["end"] = "stream misses the receiver"
+        strategy.tell(pour, answer)
+    assert strategy.finished
+    assert strategy.ask(Slots(0)) == []
+    assert "full" not in states(strategy.result()).values()
+    assert "nothing more is poured" in strategy.decisions[-1].text
+
+
 @pytest.mark.parametrize(("kind", "state"), [("pour_unknown", "unknown"), ("invalid_action", "refused")])
 def test_nothing_more_is_poured_into_a_cup_with_a_failed_dose(kind: str, state: str) -> None:
     strategy = Mix(plan(*TWO), 5)

@@ -61,7 +61,7 @@ def pour(number: int, dose: DoseTarget | None = None) -> Pour:
     return Pour("scene", ACTION, number, 1, dose=dose)
 
 
-def weighed(grams: float, **notes: str) -> Poured:
+def weighed(grams: float, **notes: object) -> Poured:
     return Poured(PourMeasurement(0.2, 0.0, 0.2 - 1e-3 * grams, dict(notes)))
 
 
@@ -87,6 +87,16 @@ def test_a_cup_with_five_times_its_amount_has_missed() -> None:
     )  # fmt: skip
     (goal,) = verdict.unmet
     assert goal.reason == "22.20 g received of 4.74 g, 16.46 g beyond the tolerance of 1 g"
+
+
+def test_a_series_that_missed_its_receiver_says_so_and_what_was_not_tried() -> None:
+    outcome = weighed(2.0, dose={"end": "stream misses the receiver"})
+    series = plan({"water": 20.0}, {"water": 20.0}, {"water": 20.0})
+    missed = [(dose(i, 20.0, f"rack/A{i}"), outcome) for i in (1, 2)]
+    verdict = verdict_of(record(missed, series=series))
+    assert verdict.text.startswith("incomplete: 0 of 3 cups reached; 2 missed, 1 not poured")
+    (goal,) = verdict.unmet
+    assert goal.reason.startswith("stream misses the receiver: 2.00 g received of 20 g, 17.00 g beyond")
 
 
 @pytest.mark.parametrize(
