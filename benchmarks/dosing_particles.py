@@ -6,9 +6,10 @@
 The bench, its balance and its arm are those of benchmarks/dosing.py; cup, receiver and stream are simulated
 (`actors.dosing.particle_liquid`). Each series is five doses of 10 to 100 g (2 to 10 g in the row 'small amounts'),
 log-uniform, from a source that is 40 to 90 % full and is filled again when it holds too little. The receiver stands
-where the row's placement says; the grip's error is drawn as on the formula's bench. Development used the seeds below
-8000; the final ones begin at 8009. A source filled to the brim has 8,000 particles: with 4,000, half of which are
-mirror images, a fine flow of 8 g/s is some thirty pairs of particles a second, and their number alone scatters.
+where the row's placement says; the grip's error is drawn as on the formula's bench. A source that is no straight cup
+begins with what a simulated dose has shown, as in a run. Development used the seeds below 8000; the final ones begin at
+8012. A source filled to the brim has 8,000 particles: with 4,000, half of which are mirror images, a fine flow of 8 g/s
+is some thirty pairs of particles a second, and their number alone scatters.
 
 The run may be interrupted: `--into FILE` appends each finished series to a file as a line of JSON, and the next run
 with this file makes the others. The first series of all rows come first, then the second ones. `--json` writes the
@@ -39,11 +40,13 @@ import numpy as np
 from actors.dosing.cup_flow import CupFlow
 from actors.dosing.dose_controller import DoseOrder
 from actors.dosing.dose_series import DoseSeries, SourceContent
+from actors.dosing.flow_comparison import compare_flows
 from actors.dosing.particle_liquid import ParticleLiquid
 from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
-from actors.interfaces import DoseEnd, InvalidActionError
+from actors.interfaces import DoseEnd, DoseKnowledge, InvalidActionError
 from actors.simulators.live_worker import LocalLivePours
+from orchestrator.campaigns.dose_flows import is_straight
 from orchestrator.campaigns.file_loading import load_vessel
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
@@ -56,7 +59,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from dosing import CUPS, OIL, PARTICLES, ROOT, cup_spec
 
 DATA = ROOT / "docs" / "data" / "dosing-particles.json"
-FIRST_SEED, FIRST_FINAL_SEED, SERIES, DOSES = 7000, 8009, 8, 5
+FIRST_SEED, FIRST_FINAL_SEED, SERIES, DOSES = 7000, 8012, 8, 5
 AMOUNTS, SMALL = (0.01, 0.1), (0.002, 0.01)
 FALL = 0.15
 GLYCEROL = {"name": "glycerol 50 %", "density": 1126.0, "dynamic_viscosity": 6e-3, "surface_tension": 0.068}
@@ -140,6 +143,21 @@ def _spec(name: str) -> VesselSpec:
     return load_vessel(ROOT / "configs" / "vessels" / f"{name}.yaml")
 
 
+@cache
+def _knowledge(name: str) -> DoseKnowledge | None:
+    """What a run knows of a source before its first dose: of one that is no straight cup, a simulated dose."""
+    row, simulator = ROWS[name], _simulator()
+    spec = _spec(row.source)
+    pourer, water = simulator.vessel(spec), Liquid(mass=0.1, **row.liquid)
+    load = water.model_copy(update={"mass": 0.65 * pourer.capacity * water.density})
+    lip = float(pourer.lip_point(0.0)[0])
+    placed = {"angular_velocity": 60 * DEG, "x_offset": lip + row.lip, "height": pourer.rim_height + 0.02}
+    scene = Scene("dose", spec, row.receiver, load, fixed=placed, mirrored=True)
+    if is_straight(scene):
+        return None
+    return compare_flows(scene, row.amounts[1], SimulationParameters(), LocalLivePours(simulator)).knowledge()
+
+
 def loss_series(name: str, seed: int) -> list[Dose]:
     """Pour the doses of one series of a row."""
     row, rng, simulator = ROWS[name], np.random.default_rng((seed, 13)), _simulator()
@@ -166,6 +184,7 @@ def loss_series(name: str, seed: int) -> list[Dose]:
         return ParticleLiquid(bench, LocalLivePours(simulator), task)
 
     first = water.model_copy(update={"mass": float(rng.uniform(0.4, 0.9)) * full})
+    known = _knowledge(name)
     doses: list[Dose] = []
     moved = 0.0
     bench = VirtualDosingBench(nominal, first, scale, seed, fall_height=FALL, poured=lambda bench: liquid(bench, moved))
@@ -178,7 +197,9 @@ def loss_series(name: str, seed: int) -> list[Dose]:
             bench.refill(0.85 * full)
         placed, content = bench.place_receiver(), SourceContent(bench.content + 0.3e-3 * float(rng.normal()))
         if series is None:
-            series = DoseSeries(flow, settings, content, placed, own, particles=PARTICLES, step=scale.step)
+            series = DoseSeries(
+                flow, settings, content, placed, own, particles=PARTICLES, step=scale.step, knowledge=known
+            )
         elif filled:
             series.fill(content)
         order = DoseOrder(amount, receiver_mass=bench.receiver_mass)
