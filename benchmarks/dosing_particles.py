@@ -151,8 +151,8 @@ def _knowledge(name: str) -> DoseKnowledge | None:
     pourer, water = simulator.vessel(spec), Liquid(mass=0.1, **row.liquid)
     load = water.model_copy(update={"mass": 0.65 * pourer.capacity * water.density})
     lip = float(pourer.lip_point(0.0)[0])
-    placed = {"angular_velocity": 60 * DEG, "x_offset": lip + row.lip, "height": pourer.rim_height + 0.02}
-    scene = Scene("dose", spec, row.receiver, load, fixed=placed, mirrored=True)
+    action = Action(angular_velocity=60 * DEG, x_offset=lip + row.lip, height=pourer.rim_height + 0.02)
+    scene = Scene("dose", spec, row.receiver, load, fixed=action.values(), mirrored=True)
     if is_straight(scene):
         return None
     return compare_flows(scene, row.amounts[1], SimulationParameters(), LocalLivePours(simulator)).knowledge()
