@@ -299,7 +299,7 @@ class DeviceEmulators:
 
     async def flow(self, order: FlowOrder) -> None:
         """Let liquid follow the arm."""
-        await self.device.call("flow", order, deadline=10.0 * DEADLINE)  # its kernels may have to be compiled
+        await self.device.call("flow", order, deadline=DEADLINE)
 
     async def frames(self) -> RecordedFrames | None:
         """Frames of the flowing particles since the last call."""
