@@ -175,12 +175,14 @@ class RecordedFrames:
         positions: F arrays (N, 3) float32, world [m].
         states: F arrays (N,) uint8, `sim_engine.outcome.ParticleState`.
         pourer_poses: (F, 7): x y z qw qx qy qz of the pourer.
+        receiver_at: x, y, z of the receiver, away from its intended place [m].
     """
 
     times: NDArray[np.float64]
     positions: list[NDArray[np.float32]]
     states: list[NDArray[np.uint8]]
     pourer_poses: NDArray[np.float64]
+    receiver_at: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def joined(self, later: RecordedFrames) -> RecordedFrames:
         """These frames and later ones of the same pour."""
@@ -189,12 +191,13 @@ class RecordedFrames:
             [*self.positions, *later.positions],
             [*self.states, *later.states],
             np.concatenate([self.pourer_poses, later.pourer_poses]),
+            self.receiver_at,
         )
 
     def copied(self) -> RecordedFrames:
         """A copy in its own memory."""
         positions, states = [np.array(p) for p in self.positions], [np.array(s) for s in self.states]
-        return RecordedFrames(np.array(self.times), positions, states, np.array(self.pourer_poses))
+        return RecordedFrames(np.array(self.times), positions, states, np.array(self.pourer_poses), self.receiver_at)
 
 
 @dataclass(frozen=True)

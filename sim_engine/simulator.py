@@ -535,7 +535,7 @@ class PourSimulator:
                 dribbling = course.dribbling.select(np.array(course.states))
                 times = np.array(course.times)
                 course.frames = rivulet_frames(course.dribbling, dribbling, motion, times, course.frames)
-        return SimulatedPour(outcome(fluid, course, loading), recorded_frames(course, motion))
+        return SimulatedPour(outcome(fluid, course, loading), recorded_frames(course, motion, task.placement))
 
     def mirrors(self, task: PourTask, motion: Motion) -> bool:
         """Whether only the half y ≥ 0 of a pour is simulated, and the other half is its mirror image.
@@ -644,13 +644,14 @@ class PourSimulator:
         close_engine()
 
 
-def recorded_frames(course: TimeLoop, motion: Motion) -> RecordedFrames | None:
+def recorded_frames(course: TimeLoop, motion: Motion, error: PoseError) -> RecordedFrames | None:
     """The frames of the whole liquid, if any were requested."""
     if not course.frames:
         return None
     times = np.array([t for t, _, _ in course.frames])
     frames = [with_mirror_image(p, s) if course.mirrored else (p, s) for _, p, s in course.frames]
-    return RecordedFrames(times, [p for p, _ in frames], [s for _, s in frames], motion.sample(times))
+    at = (error.x, error.y, error.z)
+    return RecordedFrames(times, [p for p, _ in frames], [s for _, s in frames], motion.sample(times), at)
 
 
 def with_mirror_image(

@@ -119,7 +119,9 @@ class ParticleFlow:
         self._in_flight = self.received = self.spilled = 0.0
         self.left = self._content = task.scene.liquid.mass
         self._lip = build_vessel(task.scene.pourer).meridians[:, -1]  # points of its crest
-        self._opening = build_vessel(task.scene.receiver).rim_height + task.placement.z
+        placed = task.placement
+        self._receiver_at = (placed.x, placed.y, placed.z)
+        self._opening = build_vessel(task.scene.receiver).rim_height + placed.z
         self._arrived = deque([(0.0, 0.0)])  # times [s] and masses in the receiver [kg]
         self._next_frame = 0.0
         self._frames: list[tuple[float, NDArray[np.float32], NDArray[np.uint8], Floats]] = []
@@ -159,7 +161,7 @@ class ParticleFlow:
         if not frames:
             return None
         times, positions, states, poses = zip(*frames, strict=True)
-        return RecordedFrames(np.array(times), list(positions), list(states), np.array(poses))
+        return RecordedFrames(np.array(times), list(positions), list(states), np.array(poses), self._receiver_at)
 
     def _impact(self) -> float:
         """Force on the receiver from what has just entered its opening, as a mass [kg]."""

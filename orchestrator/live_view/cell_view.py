@@ -62,6 +62,7 @@ class CellScene:
         self._trail: list[list[float]] = []
         self._moves: list[tuple[Moment, tuple[float, ...]]] = []
         self._liquid: RecordedFrames | None = None
+        self._receiver_at = (0.0, 0.0, 0.0)
         self._dosed: float | None = None  # radius of a dose's particles [m]
         self._particles = None if laboratory.bench is None else laboratory.bench.theta.particles
         self._stands: tuple[float, ...] = ()
@@ -141,6 +142,7 @@ class CellScene:
     def _flow(self, liquid: RecordedFrames, radius: float) -> None:
         """Show the particles of a dose at once, or keep them for its playback."""
         if self.time_scale <= SLOW:
+            self._set_receiver(liquid)
             shown = shapes.swarms(liquid.positions[-1:], liquid.states[-1:], radius)
             self._sink.rows(f"{PLACE}/liquid", [self._sink.now], shown)
         else:
@@ -210,6 +212,8 @@ class CellScene:
         def begin() -> None:
             if len(path) > 1:
                 self._sink.log(f"{PLACE}/path/executed", self._line(path, style.MEASURED, 3e-3))
+            if liquid is not None:
+                self._set_receiver(liquid)
 
         self._films.add(now, step, Playback(float(times[-1]), tracks, begin, told))
 
@@ -257,6 +261,12 @@ class CellScene:
         if self._shown.get(entity) != (key := spec.content_hash()):
             self._shown[entity] = key
             self._sink.log(f"{PLACE}/{entity}/mesh", shapes.mesh(spec))
+
+    def _set_receiver(self, liquid: RecordedFrames) -> None:
+        """Move the receiver to where a virtual bench has it; elsewhere only its intended place is known."""
+        if self._receiver_at != liquid.receiver_at:
+            self._receiver_at = liquid.receiver_at
+            self._sink.log(f"{PLACE}/receiver", rr.Transform3D(translation=liquid.receiver_at))
 
     def _tool_places(self, poses: FloatArray) -> FloatArray:
         return poses[:, :3] if self._figure is None else self._figure.tool_of(poses)

@@ -80,12 +80,12 @@ class SimulatedStage:
         film = Playback(
             float(moments[-1]),
             tracks,
-            begin=lambda: self._set(scene, title),
+            begin=lambda: self._set(scene, title, frames.receiver_at),
             end=lambda: self._sink.clear(f"{PLACE}/share", recursive=True),  # no line to the next playback
         )
         self._films.add(now, step, film)
 
-    def _set(self, scene: Scene, title: str) -> None:
+    def _set(self, scene: Scene, title: str, receiver_at: tuple[float, float, float]) -> None:
         self._sink.log(f"{PLACE}/title", rr.TextDocument(f"### {title}", media_type="text/markdown"))
         for role, spec in (("pourer", scene.pourer), ("receiver", scene.receiver)):
             # Viewers of the wall clock don't see rows that are left out of it.
@@ -93,6 +93,7 @@ class SimulatedStage:
             if self._shown.get(place) != key:
                 self._shown[place] = self._shown[role, False] = key
                 self._sink.log(f"{PLACE}/{role}/mesh", shapes.mesh(spec))
+        self._sink.log(f"{PLACE}/receiver", rr.Transform3D(translation=receiver_at))
 
 
 def thinned(times: NDArray[np.float64]) -> list[int]:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from actors.arm.arm_interface import ArmFigure
     from actors.arm.planned_pour import PourPath
     from sim_engine.outcome import SimulatedPour
-    from sim_engine.scene import PourTask
+    from sim_engine.scene import PourTask, Scene
     from sim_engine.vessel.vessel import Vessel
 
 Floats = NDArray[np.float64]
@@ -145,7 +145,6 @@ def simulation_figure(task: PourTask, result: SimulatedPour) -> Figure:
         result,
         build_vessel(scene.pourer),
         build_vessel(scene.receiver),
-        receiver_shift=(task.placement.x, task.placement.z),
         title=title,
         note=note,
     )
@@ -158,7 +157,6 @@ def draw_pour(
     *,
     title: str,
     note: str = "",
-    receiver_shift: tuple[float, float] = (0.0, 0.0),
     snapshots: int = 4,
 ) -> Figure:
     """Snapshots of a pour from the side (vessels cut at y = 0), above the shares of the liquid over time.
@@ -166,16 +164,15 @@ def draw_pour(
     Args:
         result: a simulated pour with frames.
         pourer: its surface.
-        receiver: its surface; its position is x and z = `receiver_shift` [m].
+        receiver: its surface.
         title: first line.
         note: second line.
-        receiver_shift: x and z of the receiver [m].
         snapshots: number of snapshots.
 
     Raises:
         ValueError: the result has no frames.
     """
-    shown = _Snapshots(result, pourer, receiver, receiver_shift, snapshots)
+    shown = _Snapshots(result, pourer, receiver, snapshots)
     figure, grid = style.new_figure(
         2,
         snapshots,
@@ -199,11 +196,11 @@ STRIP = 6
 """Number of snapshots of a film strip."""
 
 
-def film_strip(task: PourTask, result: SimulatedPour, *, title: str) -> Figure:
+def film_strip(scene: Scene, result: SimulatedPour, *, title: str) -> Figure:
     """Snapshots of a simulated pour from the side, in one row.
 
     Args:
-        task: its scene and placement.
+        scene: its vessels.
         result: its result, with frames.
         title: above them.
 
@@ -212,8 +209,7 @@ def film_strip(task: PourTask, result: SimulatedPour, *, title: str) -> Figure:
     """
     from sim_engine.vessel.vessel import build_vessel
 
-    vessels = build_vessel(task.scene.pourer), build_vessel(task.scene.receiver)
-    shown = _Snapshots(result, *vessels, (task.placement.x, task.placement.z), STRIP)
+    shown = _Snapshots(result, build_vessel(scene.pourer), build_vessel(scene.receiver), STRIP)
     figure, grid = style.new_figure(1, STRIP, size=(2.0 * STRIP, 2.0 * shown.aspect + 0.6), squeeze=False)
     figure.suptitle(title, fontsize=12.5, color=style.INK, x=0.01, ha="left")
     shown.draw(grid[0])
@@ -223,9 +219,7 @@ def film_strip(task: PourTask, result: SimulatedPour, *, title: str) -> Figure:
 class _Snapshots:
     """Moments of a simulated pour, and the part of the plane y = 0 that shows both vessels in all of them."""
 
-    def __init__(
-        self, result: SimulatedPour, pourer: Vessel, receiver: Vessel, receiver_shift: tuple[float, float], count: int
-    ) -> None:
+    def __init__(self, result: SimulatedPour, pourer: Vessel, receiver: Vessel, count: int) -> None:
         frames = result.frames
         if frames is None or len(frames.times) == 0:
             raise ValueError("this simulation kept no frames to draw; simulate it with a record rate above 0")
@@ -236,7 +230,7 @@ class _Snapshots:
         self._outlines = [
             section(np.asarray(v.solid_vertices, float), np.asarray(v.solid_faces)) for v in (pourer, receiver)
         ]
-        self._stand = UPRIGHT + np.array([receiver_shift[0], 0, receiver_shift[1], 0, 0, 0, 0])
+        self._stand = UPRIGHT + np.array([*frames.receiver_at, 0, 0, 0, 0])
         self._window = _window(self._outlines, np.asarray(frames.pourer_poses, float)[self.chosen], self._stand)
         left, right, low, high = self._window
         self.aspect = min(max((high - low) / (right - left), 0.7), 1.9)

@@ -48,7 +48,7 @@ from orchestrator.reports.surrogate_figures import (
 from orchestrator.runs.run_folder import dose_film_file, film_file, read_film
 from orchestrator.runs.stages import recommended_pours, scenes_of
 from sim_engine.prediction_band import LEVEL
-from sim_engine.scene import PourTask
+from sim_engine.scene import Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -133,8 +133,7 @@ def _drawings(plan: CampaignPlan, results: Results, directory: Path | None = Non
         scenes = scenes_of(plan)
         for name, pour in recommended_pours(plan, results).items():
             if (file := film_file(directory, name)).is_file():
-                task = PourTask(scenes[pour.scene], pour.action, pour.parameters, pour.seed)
-                drawings[f"recommended pour {name}"] = partial(_recommended, task, file)
+                drawings[f"recommended pour {name}"] = partial(_recommended, scenes[pour.scene], file)
     return drawings
 
 
@@ -150,22 +149,21 @@ def _dose_films(plan: CampaignPlan, results: Results, directory: Path) -> dict[s
         receiver = plan.dispense.doses[min(dose.number, len(plan.dispense.doses)) - 1].receiver
         scene = plan.dispense.scene(dose.source, receiver)
         title = f"Dose {dose.number} from {dose.source}: {dose.wanted_g:g} g wanted, {dose.outcome_text or dose.end}"
-        task = PourTask(scene, scene.action({}), plan.parameters, 0)
-        films[f"film of dose {dose.number}"] = partial(_film, task, file, title)
+        films[f"film of dose {dose.number}"] = partial(_film, scene, file, title)
     return films
 
 
-def _film(task: PourTask, file: Path, title: str) -> Figure:
-    return film_strip(task, read_film(file), title=title)
+def _film(scene: Scene, file: Path, title: str) -> Figure:
+    return film_strip(scene, read_film(file), title=title)
 
 
-def _recommended(task: PourTask, file: Path) -> Figure:
+def _recommended(scene: Scene, file: Path) -> Figure:
     pour = read_film(file)
     got = pour.outcome
     shares = (
         f"{100 * got.received:.1f} % received, {100 * got.spilled:.1f} % spilled, {100 * got.retained:.1f} % retained"
     )
-    return film_strip(task, pour, title=f"The recommended pour into {task.scene.receiver.name}, simulated: {shares}")
+    return film_strip(scene, pour, title=f"The recommended pour into {scene.receiver.name}, simulated: {shares}")
 
 
 def discrepancy_groups(evaluation: Scores) -> list[DiscrepancyGroup]:

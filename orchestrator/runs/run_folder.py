@@ -171,6 +171,7 @@ def dose_moments(scene: Scene, mass: float, frames: RecordedFrames) -> Simulated
         [frames.positions[i] for i in chosen],
         [frames.states[i] for i in chosen],
         frames.pourer_poses[chosen],
+        frames.receiver_at,
     )
     return SimulatedPour(outcome, kept)
 
@@ -191,6 +192,7 @@ def write_film(path: Path, pour: SimulatedPour) -> None:
         positions=np.stack(frames.positions),
         states=np.stack(frames.states),
         poses=frames.pourer_poses,
+        receiver_at=np.array(frames.receiver_at),
     )
 
 
@@ -201,7 +203,9 @@ def read_film(path: Path) -> SimulatedPour:
         OSError, ValueError: it can't be read.
     """
     with np.load(path) as archive:
-        frames = RecordedFrames(archive["times"], list(archive["positions"]), list(archive["states"]), archive["poses"])
+        x, y, z = archive["receiver_at"].tolist() if "receiver_at" in archive else (0.0, 0.0, 0.0)  # before 0.3
+        particles = list(archive["positions"]), list(archive["states"])
+        frames = RecordedFrames(archive["times"], *particles, archive["poses"], (x, y, z))
         return SimulatedPour(from_json(json.loads(str(archive["outcome"])), PourOutcome), frames)
 
 

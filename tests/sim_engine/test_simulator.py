@@ -183,6 +183,13 @@ def test_a_mirrored_pour_is_dense_at_the_plane_and_its_stream_as_thick(
     assert thickness[True] == pytest.approx(thickness[False], rel=0.04)
 
 
+def test_recorded_frames_tell_where_the_receiver_stands(simulator: PourSimulator) -> None:
+    aside = dataclasses.replace(task(1), pose_error=PoseError(x=0.004, y=-0.002, z=0.001), frame_rate=5.0)
+    frames = simulator.simulate(aside).frames
+    assert frames is not None
+    assert frames.receiver_at == (0.004, -0.002, 0.001)
+
+
 def test_recorded_frames_show_the_liquid_from_the_start_of_a_slow_pour(simulator: PourSimulator) -> None:
     slow = dataclasses.replace(task(1, speed=20.0), frame_rate=5.0)
     run = simulator.simulate(slow)

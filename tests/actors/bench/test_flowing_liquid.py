@@ -8,7 +8,7 @@ import itertools
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ from actors.interfaces import LaboratoryError
 from actors.simulators.live_worker import LivePourProcess
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.live_pour import LiveState
-from sim_engine.scene import PourTask, SampledMotion, Scene
+from sim_engine.scene import PoseError, PourTask, SampledMotion, Scene
 from sim_engine.vessel.shapes import cylinder
 from tests.support.waiting import PATIENCE
 
@@ -113,8 +113,8 @@ class Drips:
         pass
 
 
-def particles(drips: Drips, *, watched: bool = False) -> ParticleFlow:
-    return ParticleFlow(DOSE, drips, UPRIGHT, watched=watched)
+def particles(drips: Drips) -> ParticleFlow:
+    return ParticleFlow(DOSE, drips, UPRIGHT)
 
 
 def stand(flow: ParticleFlow, begin: float, end: float, pose: NDArray[np.float64]) -> float:
@@ -173,10 +173,12 @@ def test_a_cup_that_stands_tilted_and_pours_is_simulated() -> None:
 
 
 def test_frames_for_a_live_view_are_kept_with_the_time_of_the_dose() -> None:
-    flow = particles(Drips(), watched=True)
+    aside = replace(DOSE, pose_error=PoseError(x=0.05, z=-0.01))
+    flow = ParticleFlow(aside, Drips(), UPRIGHT, watched=True)
     stand(flow, 0.0, 3.0, UPRIGHT)
     frames = flow.frames()
     assert frames is not None
+    assert frames.receiver_at == (0.05, 0.0, -0.01)
     assert frames.times[-1] == pytest.approx(3.0)
     assert len(frames.times) > 10
     assert flow.frames() is None

@@ -168,7 +168,9 @@ def test_the_particles_of_a_dose_are_shown_live_or_in_a_playback(tmp_path: Path,
     def frame(time: float) -> RecordedFrames:
         fate = int(ParticleState.RECEIVED if time > 2.0 else ParticleState.IN_POURER)
         places = np.full((5, 3), 0.01 * time, np.float32)
-        return RecordedFrames(np.array([time]), [places], [np.full(5, fate, np.uint8)], np.eye(1, 7, 3))
+        return RecordedFrames(
+            np.array([time]), [places], [np.full(5, fate, np.uint8)], np.eye(1, 7, 3), (0.05, 0.0, 0.0)
+        )
 
     begin = events[2].time
     flows: list[Event] = [
@@ -186,6 +188,8 @@ def test_the_particles_of_a_dose_are_shown_live_or_in_a_playback(tmp_path: Path,
     fates = Contents(path).values("/cell/liquid", "Points3D:class_ids")
     assert len(fates) >= 39
     assert {int(np.asarray(each)[0]) for each in fates} == {int(ParticleState.IN_POURER), int(ParticleState.RECEIVED)}
+    (receiver,) = Contents(path).values("/cell/receiver", "Transform3D:translation")
+    assert np.ravel(receiver) == pytest.approx([0.05, 0.0, 0.0])
 
 
 @pytest.mark.slow
