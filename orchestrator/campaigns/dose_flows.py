@@ -122,7 +122,7 @@ def dose_flows(plan: CampaignPlan, doing: Callable[[str], None] = lambda text: N
         doing(f"simulating a dose of {1e3 * amount:.3g} g of {scene.liquid.name} out of '{scene.pourer.name}'")
         try:
             flows.append(
-                DoseFlow(scene, amount, tolerance, _compared(_content(scene, amount, theta), scene, amount, theta))
+                DoseFlow(scene, amount, tolerance, _compared(dose_digest(scene, amount, theta), scene, amount, theta))
             )
         except (LaboratoryError, OSError) as error:
             flows.append(DoseFlow(scene, amount, tolerance, None, str(error)))
@@ -136,13 +136,18 @@ def simulated_knowledge(plan: CampaignPlan) -> dict[str, DoseKnowledge]:
     }
 
 
-def _content(scene: Scene, amount: float, theta: SimulationParameters) -> str:
-    """Digest of all that a comparison depends on."""
+def dose_digest(scene: Scene, *further: object) -> str:
+    """Digest of all that a computed dose depends on.
+
+    Args:
+        scene: of the dose.
+        further: what else it depends on; equal values have equal representations.
+    """
     liquid = scene.liquid.model_dump_json(exclude={"name"})
     vessels = scene.pourer.content_hash(), scene.receiver.content_hash()
     code = folder_digest(ROOT / "sim_engine"), folder_digest(ROOT / "actors" / "dosing"), engine_version()
-    placed = repr((scene.pivot, sorted(scene.fixed.items()), amount)), theta.model_dump_json()
-    return hashlib.sha256("\n".join((*vessels, liquid, *code, *placed)).encode()).hexdigest()[:24]
+    others = repr((scene.pivot, sorted(scene.fixed.items()), *further))
+    return hashlib.sha256("\n".join((*vessels, liquid, *code, others)).encode()).hexdigest()[:24]
 
 
 _compared_before: dict[str, FlowComparison] = {}

@@ -6,22 +6,27 @@ is known yet; the errors of the doses between are interpolated. Later doses are 
 
 from __future__ import annotations
 
-import functools
 import itertools
+import json
 import math
-import pickle
 from collections import Counter
 from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from actors.dosing.display_belief import DisplayBelief
 from actors.dosing.dose_series import DoseForecast, predict_dose
+from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseSource, DoseTarget
 from actors.laboratory import expected_display
+from orchestrator.campaigns.dose_flows import dose_digest
 from orchestrator.learning.campaign_plan import CampaignPlan, PlannedDose
 from orchestrator.learning.dispense import FILL_DEVIATION, WEIGHED_DEVIATION, KnownSource, share_deviation
 from orchestrator.learning.mixtures import dose_strategy
 from orchestrator.learning.trials import SeedStream
+from orchestrator.records.codec import from_json, to_json
+from sim_engine.resources import load_arrays, store_arrays
+from sim_engine.scene import Scene
 
 PREDICTED = 8
 """Simulated doses of each prediction."""
@@ -80,7 +85,7 @@ class MixtureForecast:
         source = DoseSource(scene.pourer.name, scene.liquid.mass, FILL_DEVIATION, fill=True, constants=0)
         target = DoseTarget(dose.amount, dose.limit, dose.position, source)
         display = expected_display(self._laboratory.balance)
-        return _predicted(pickle.dumps((scene, target, seed, self._laboratory.dosing, PREDICTED, display)))
+        return _predicted(scene, target, seed, self._laboratory.dosing, display)
 
     def _fillings(self, seed: int) -> Counter[str]:
         strategy, fills = dose_strategy(self._series, seed), Counter[str]()
@@ -171,14 +176,18 @@ class MixtureForecast:
         )
 
 
-@functools.lru_cache(maxsize=256)
-def _predicted(asked: bytes) -> DoseForecast:
-    """A prediction, made once in a process: a campaign is checked when it is submitted, and again when it begins.
-
-    Args:
-        asked: pickled arguments of `predict_dose`.
-    """
-    return predict_dose(*pickle.loads(asked))
+def _predicted(
+    scene: Scene, target: DoseTarget, seed: int, settings: DosingSettings, display: DisplayBelief | None
+) -> DoseForecast:
+    """A prediction, kept in the cache directory: a campaign is checked by `validate`, and again when it begins."""
+    name = f"forecast-{dose_digest(scene, target, seed, settings, PREDICTED, display)}"
+    stored = load_arrays(name)
+    if stored is not None:
+        found: DoseForecast = from_json(json.loads(str(stored["forecast"])), DoseForecast)
+        return found
+    predicted = predict_dose(scene, target, seed, settings, PREDICTED, display)
+    store_arrays(name, {"forecast": np.array(json.dumps(to_json(predicted, DoseForecast)))})
+    return predicted
 
 
 def _half(amount: float, predicted: DoseForecast) -> float:

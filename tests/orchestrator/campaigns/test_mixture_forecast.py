@@ -82,17 +82,23 @@ def test_later_doses_and_a_second_check_cost_no_further_predictions(
     path.write_text(CAMPAIGN.replace("outputs", rows + "outputs"), encoding="utf-8")
     from orchestrator.campaigns import mixture_forecast
 
-    monkeypatch.setattr(mixture_forecast, "PREDICTED", 2)  # predictions that no other test makes
+    monkeypatch.setenv("DECANT_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(mixture_forecast, "PREDICTED", 2)
     calls = []
     original = mixture_forecast.predict_dose
     monkeypatch.setattr(mixture_forecast, "predict_dose", lambda *a: calls.append(a) or original(*a))
     said: list[str] = []
-    MixtureForecast(load_campaign(path), said.append)
+    first = MixtureForecast(load_campaign(path), said.append)
     assert said[0] == "predicting the doses of the mixtures, 1 of 4: 20 g of ethanol"
     assert len(said) == len(set(said)) == 4
     assert len(calls) == 4
-    MixtureForecast(load_campaign(path))
+    assert MixtureForecast(load_campaign(path)).lines() == first.lines()  # also in another process
     assert len(calls) == 4
+    path.write_text(
+        path.read_text(encoding="utf-8").replace("mixtures:", "mixtures:\n  tolerance: 2 g", 1), encoding="utf-8"
+    )
+    MixtureForecast(load_campaign(path))
+    assert len(calls) == 8
 
 
 RACK = Path(__file__).parents[3] / "configs" / "laboratories" / "rack.yaml"
