@@ -42,6 +42,10 @@ LATEST, LATEST_PARTICLES = 0.08, 0.04
 """Time from one reading to the next one [s of the clock], for which the clock of the bench waits; with particles, whose
 simulation may be slower than the clock, it is the time by which the balance sees the liquid late."""
 
+SLICE = 5
+"""Samples of the arm's motion after which the promise is renewed: however slow the simulation, the clock of the bench
+waits until it has caught up."""
+
 SILENCE = 30.0
 """Time without an answer of the arm's emulator after which nothing flows any more [s]: the emulator has ended."""
 
@@ -203,6 +207,7 @@ class FlowingLiquid:
             pose = self._poses(np.array(recent))[0]
             self._flow = ParticleFlow(order.liquid, pours, pose, watched=order.watched)
             self._latest = LATEST_PARTICLES
+        self._bench_clock = device_clock(arm.clock)
         self._begun = self._since = self._clock = history(1e12).now  # a process may have been started before
         self._tilt = 0.0
         self._problem: LaboratoryError | None = None
@@ -210,6 +215,7 @@ class FlowingLiquid:
         self._signals: list[tuple[float, float, float]] = []
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="liquid", daemon=True)
+        self._bench_clock.promise("liquid", self._latest)
         self._thread.start()
 
     def frames(self) -> RecordedFrames | None:
@@ -226,6 +232,7 @@ class FlowingLiquid:
         self._thread.join()  # however long its step takes: what simulates particles is for one thread at a time
         with contextlib.suppress(LaboratoryError):
             self._follow()
+        self._bench_clock.withdraw("liquid")
         if self._problem is not None:
             raise self._problem
         flow = self._flow
@@ -241,8 +248,7 @@ class FlowingLiquid:
         return self._flow.spilled if self._order.on_tray else 0.0
 
     def _run(self) -> None:
-        answered, clock = time.monotonic(), device_clock(self._arm.clock)
-        spent = 0.0
+        answered, spent = time.monotonic(), 0.0
         try:
             while not self._ending.wait(max(INTERVAL - spent, 0.0)):
                 begun = time.monotonic()
@@ -253,11 +259,11 @@ class FlowingLiquid:
                     if time.monotonic() - answered > SILENCE:
                         return
                 spent = time.monotonic() - begun
-                clock.promise("liquid", self._latest)
+                self._bench_clock.promise("liquid", self._latest)
                 if self._problem is not None or self._clock - self._begun > 20.0 * LONGEST_DOSE:
                     return
         finally:
-            clock.withdraw("liquid")
+            self._bench_clock.withdraw("liquid")
 
     def _follow(self) -> None:
         """Pour along the motion since the last call."""
@@ -267,19 +273,22 @@ class FlowingLiquid:
             return
         times = np.array([t for t, _ in fresh]) - self._begun
         poses = self._poses(np.array([q for _, q in fresh]))
-        try:
-            load = self._flow.follow(times, poses)
-        except LaboratoryError as problem:
-            self._problem = problem
-            return
-        self._since = self._clock = fresh[-1][0]
-        self._tilt = float(_tilts(poses[-1:])[0])
-        if self._tilt > 0.02:
-            self._upright_since = None
-        elif self._upright_since is None:
-            self._upright_since = self._clock
-        self._signals.append((self._clock - self._begun, self._tilt, self._flow.received))
-        self._put(self._order.base + load + self._spilled)
+        for first in range(0, len(times), SLICE):
+            some = slice(first, first + SLICE)
+            try:
+                load = self._flow.follow(times[some], poses[some])
+            except LaboratoryError as problem:
+                self._problem = problem
+                return
+            self._since = self._clock = fresh[: first + SLICE][-1][0]
+            self._tilt = float(_tilts(poses[some][-1:])[0])
+            if self._tilt > 0.02:
+                self._upright_since = None
+            elif self._upright_since is None:
+                self._upright_since = self._clock
+            self._signals.append((self._clock - self._begun, self._tilt, self._flow.received))
+            self._put(self._order.base + load + self._spilled)
+            self._bench_clock.promise("liquid", self._latest - (changes.now - self._clock))
 
     def _poses(self, joints: Floats) -> Floats:
         """True poses of the pourer, (T, 7); a formula has its own error of the grip."""

@@ -308,7 +308,7 @@ class DeviceEmulators:
 
     async def flowed(self) -> FlowEnd:
         """End the flow. Returns what flowed."""
-        end: FlowEnd = await self.device.call("flowed", deadline=DEADLINE)
+        end: FlowEnd = await self.device.call("flowed", deadline=10.0 * DEADLINE)  # thick liquid takes minutes
         return end
 
     async def close(self) -> None:

@@ -101,7 +101,10 @@ class DeviceClock:
         return time.monotonic()
 
     def promise(self, program: str, seconds: float) -> None:
-        """State that a program acts again before so much time has passed [s]; a shared clock waits for it then."""
+        """State that a program acts again before so much time has passed [s]; a shared clock waits for it then.
+
+        A program that is behind by more renews its promise with a negative time while it catches up.
+        """
 
     def withdraw(self, program: str) -> None:
         """End a program's promise."""
@@ -123,7 +126,7 @@ class SharedClock(DeviceClock):
         with path.open("r+b") as file:
             self._numbers = memoryview(mmap.mmap(file.fileno(), 0)).cast("d")
         self._latest = -math.inf
-        self._stands_since: float | None = None
+        self._late: dict[str, tuple[float, float]] = {}  # promises that it waits for, and since when [s]
 
     @staticmethod
     def create(path: Path) -> None:
@@ -165,19 +168,21 @@ class SharedClock(DeviceClock):
     def may_pass(self, seconds: float) -> bool:
         """Whether so much time may pass now [s]: not beyond a promise.
 
-        The clock waits neither for a process that has ended nor longer than `LONGEST_STAND` of wall time.
+        The clock waits neither for a process that has ended nor longer than `LONGEST_STAND` of wall time for one that
+        does not renew its promise.
         """
-        after = self._numbers[_NOW] + seconds
-        late = [program for program in PROGRAMS if self._numbers[_place(program)] < after]
-        if not late:
-            self._stands_since = None
-            return True
-        self._stands_since = self._stands_since or time.monotonic()
-        hangs = time.monotonic() - self._stands_since > LONGEST_STAND
-        for program in late:
-            if hangs or not _lives(int(self._numbers[_place(program) + 1])):
+        after, wall = self._numbers[_NOW] + seconds, time.monotonic()
+        promised = {program: self._numbers[_place(program)] for program in PROGRAMS}
+        before = self._late
+        self._late = {
+            program: before[program] if before.get(program, (math.nan, wall))[0] == moment else (moment, wall)
+            for program, moment in promised.items()
+            if moment < after
+        }
+        for program, (_, since) in self._late.items():
+            if wall - since > LONGEST_STAND or not _lives(int(self._numbers[_place(program) + 1])):
                 self.withdraw(program)
-        return False
+        return not self._late
 
 
 def _place(program: str) -> int:

@@ -7,8 +7,10 @@ from __future__ import annotations
 import itertools
 import math
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,12 +22,14 @@ from actors.bench.flowing_liquid import FOLLOWED, FlowingLiquid, FlowOrder, Form
 from actors.dosing.particle_liquid import CALM, ParticleFlow
 from actors.dosing.virtual_dosing_bench import TrueCup
 from actors.interfaces import LaboratoryError
+from actors.runtime import bench_clock
+from actors.runtime.bench_clock import SharedClock
 from actors.simulators.live_worker import LivePourProcess
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.live_pour import LiveState
 from sim_engine.scene import PoseError, PourTask, SampledMotion, Scene
 from sim_engine.vessel.shapes import cylinder
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, wait_for
 
 
 @dataclass(frozen=True)
@@ -120,8 +124,8 @@ def particles(drips: Drips) -> ParticleFlow:
 def stand(flow: ParticleFlow, begin: float, end: float, pose: NDArray[np.float64]) -> float:
     """Stand in a pose, in steps of 0.1 s. Returns the load on the balance."""
     load = 0.0
-    for time in np.arange(begin + 0.1, end + 0.05, 0.1):
-        load = flow.follow(np.array([time - 0.05, time]), np.array([pose, pose]))
+    for moment in np.arange(begin + 0.1, end + 0.05, 0.1):
+        load = flow.follow(np.array([moment - 0.05, moment]), np.array([pose, pose]))
     return load
 
 
@@ -262,3 +266,46 @@ def test_the_end_waits_for_a_step_that_takes_long_and_makes_none_next_to_it(monk
     liquid._thread.join(PATIENCE)
     assert not drips.overlapped
     assert end.received + end.spilled > 0.0
+
+
+class LateDrips(Drips):
+    """Simulated four times as slowly as the clock passes. The first step takes longer than the clock waits."""
+
+    def advance(self, times: NDArray[np.float64], poses: NDArray[np.float64]) -> LiveState:
+        time.sleep(0.03 * len(times) if self.moments else 0.5)
+        return super().advance(times, poses)
+
+
+def test_the_clock_of_the_bench_waits_for_a_simulation_that_is_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(flowing_liquid, "arm_kind", lambda spec: Kind())
+    monkeypatch.setattr(bench_clock, "LONGEST_STAND", 0.25)
+    SharedClock.create(tmp_path / "clock")
+    clock, ending = SharedClock(tmp_path / "clock"), threading.Event()
+
+    def advance() -> None:
+        while not ending.wait(0.004):
+            clock.advance(0.008 if clock.may_pass(0.008) else 0.0)
+
+    def history(since: float) -> Motion:
+        now = clock.now
+        times = tuple(float(t) for t in np.arange(max(since, now - 60.0), now, 0.008)[1:])
+        return Motion(times, ((0.0,) * 6,) * len(times), now)
+
+    thread = threading.Thread(target=advance, daemon=True)
+    thread.start()
+    drips, arm = LateDrips(), UrArmSettings.model_construct(clock=str(tmp_path / "clock"))
+    begun = clock.now
+    liquid = FlowingLiquid(FlowOrder(DOSE, 0.1), arm, history, lambda load: None, drips)  # type: ignore[arg-type]
+    try:
+        wait_for(lambda: clock.now - begun > 0.3, "the clock goes on without the first step, which takes too long")
+        wait_for(lambda: clock.now - begun - (drips.moments or [0.0])[-1] < 0.1, "the simulation catches up")
+        for _ in range(20):
+            done = drips.moments[-1]
+            wait_for(lambda: drips.moments[-1] > done, "the simulation goes on")  # noqa: B023
+            assert clock.now - begun - drips.moments[-1] < 0.15
+    finally:
+        ending.set()
+        thread.join()
+        liquid.end()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
@@ -48,6 +49,24 @@ def test_it_does_not_pass_what_a_program_has_promised_until_the_program_acts_aga
     assert not controller.may_pass(0.2)
     worker.withdraw("arm")
     assert controller.may_pass(1e9)
+
+
+def test_it_goes_on_without_a_program_that_hangs_and_waits_for_one_that_catches_up(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wall = itertools.count(1000.0, 1.0)
+    monkeypatch.setattr(bench_clock, "LONGEST_STAND", 5.0)
+    controller, slow = SharedClock(file), SharedClock(file)
+    monkeypatch.setattr(bench_clock.time, "monotonic", lambda: next(wall))
+    for behind in range(50, 0, -1):
+        slow.promise("liquid", -0.1 * behind)
+        assert [controller.may_pass(0.002) for _ in range(3)] == [False] * 3
+    slow.promise("liquid", 0.1)
+    assert controller.may_pass(0.002)
+    slow.promise("liquid", 0.0)
+    passes = [controller.may_pass(0.002) for _ in range(12)]
+    assert passes == sorted(passes), "it stands, and then goes on"
+    assert 5 <= passes.count(False) <= 8
 
 
 def test_it_waits_for_no_program_that_has_ended(file: Path) -> None:
