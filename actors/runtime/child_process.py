@@ -86,7 +86,7 @@ def own_environment(**values: str | None) -> Iterator[None]:
     finally:
         _set_environment(before)
         for name in before:
-            del _hidden[name]
+            _hidden.pop(name, None)  # another thread may have ended the same change
 
 
 def _set_environment(values: Mapping[str, str | None]) -> None:
