@@ -202,6 +202,9 @@ LONGEST_HOLD = (1.6, 5.0)
 IMPROBABLE_HOLD = math.log(0.005)
 """Logarithm of the probability of such a row of equal readings after which this happens earlier."""
 
+UNLIKELY = 0.01
+"""Share of a first dose's belief in the flow factor that a smaller flow contradicts; a simulated dose may widen it."""
+
 DECREASE = 1e-3
 """Largest decrease of the reading while the balance is silent; after a larger one it was set to zero [kg]."""
 
@@ -777,8 +780,12 @@ class DoseController:
         return self._belief.doses > 0 and self._known.lacks(arrived, delay, share=0.8)
 
     def _flows_less(self) -> bool:
-        """Whether far less flows than in the doses before."""
-        return median(self._estimator.flow_factor) * LARGEST_CHANGE < median(self._belief.flow_factor)
+        """Whether far less flows than in the doses before, or than a first dose expects at least."""
+        before = self._belief.flow_factor
+        least = median(before) / LARGEST_CHANGE
+        if self._belief.doses == 0:
+            least = min(least, quantile(before, UNLIKELY))
+        return median(self._estimator.flow_factor) < least
 
     def _lost_stream(self) -> DoseEnd:
         """Why less arrives than should have left the cup."""

@@ -619,6 +619,21 @@ def test_a_stream_that_begins_earlier_than_any_particle_expects_is_believed(seed
     assert bench.dose(series.controller(order, seed=seed)).received < order.amount + 3.0 * order.limit
 
 
+@pytest.mark.parametrize("seed", [2, 3, 4])
+def test_a_first_dose_that_flows_as_slowly_as_a_simulated_one_does_not_look_like_a_missing_stream(seed: int) -> None:
+    """Half glycerol flows at a third of the equation's rate: each time it did, the cup was turned back, 26 g short."""
+    bench = VirtualDosingBench(SPOUTED, WATER, TrueScale(lag=0.3), seed)
+    bench.discharge *= 0.33
+    covariance = (math.radians(1.77) ** 2, 0.0159, 0.0159, 0.53)  # of half glycerol out of a spouted beaker
+    knowledge = replace(calibrated_knowledge([0.0]), covariance=covariance)
+    placed, rng = bench.place_receiver(), np.random.default_rng(seed)
+    series = DoseSeries(CUP, DosingSettings(), SourceContent(0.3), placed, rng, particles=80, knowledge=knowledge)
+    controller = series.controller(DoseOrder(0.035, receiver_mass=bench.receiver_mass), seed=seed)
+    record = bench.dose(controller)
+    assert record.received == pytest.approx(0.035, abs=1e-3)
+    assert record.duration < 13.0  # with a pause 17 s
+
+
 def test_a_dose_that_was_misled_does_not_mislead_the_next_one() -> None:
     """Late drops looked like a quarter of the flow, 2° early: the next dose poured 6 g too much."""
     placed, rng = VirtualDosingBench(SPOUTED, WATER, TrueScale(lag=0.3), 1).place_receiver(), np.random.default_rng(1)
