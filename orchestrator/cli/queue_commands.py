@@ -76,9 +76,9 @@ def start(
             simulators=simulators,
             in_process=in_process or None,
         )
-        server_process.log_lines()
         text = f"state in {chosen.state}. 'decant queue submit CAMPAIGN' queues one"
-        server_process.serve(chosen, lambda url: print_message(f"serving {url}; {text}"))
+        with server_process.log_lines():
+            server_process.serve(chosen, lambda url: print_message(f"serving {url}; {text}"))
     except OSError as error:
         where = error.filename or "state directory"
         cure = "--state or $DECANT_STATE names another folder"

@@ -365,8 +365,9 @@ class _UtcFormatter(JsonFormatter):
         return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
 
 
-def log_lines(stream: Any = None) -> None:
-    """Configure structured logs: one JSON object per line on stdout, as service managers collect them."""
+@contextlib.contextmanager
+def log_lines(stream: Any = None) -> Iterator[None]:
+    """Write structured logs while the body runs: a JSON object per line on stdout, as service managers collect them."""
     handler = logging.StreamHandler(stream or sys.stdout)
     form = _UtcFormatter(
         "{asctime}{levelname}{name}{message}",
@@ -376,7 +377,13 @@ def log_lines(stream: Any = None) -> None:
     )
     handler.setFormatter(form)
     root = logging.getLogger()
+    before = root.handlers, root.level
     root.handlers = [handler]
     root.setLevel(logging.INFO)
     for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "httpx"):
         logging.getLogger(name).setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        root.handlers = before[0]
+        root.setLevel(before[1])

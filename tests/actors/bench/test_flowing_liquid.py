@@ -7,10 +7,10 @@ from __future__ import annotations
 import itertools
 import math
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -268,44 +268,52 @@ def test_the_end_waits_for_a_step_that_takes_long_and_makes_none_next_to_it(monk
     assert end.received + end.spilled > 0.0
 
 
+@dataclass
 class LateDrips(Drips):
-    """Simulated four times as slowly as the clock passes. The first step takes longer than the clock waits."""
+    """Each step takes some looks of the controller at its clock; the first one more than the clock waits for."""
+
+    looks: Callable[[], int] = lambda: 0
 
     def advance(self, times: NDArray[np.float64], poses: NDArray[np.float64]) -> LiveState:
-        time.sleep(0.03 * len(times) if self.moments else 0.5)
+        end = self.looks() + (3 * len(times) if self.moments else 45)
+        wait_for(lambda: self.looks() >= end, "the controller looks at its clock", poll=1e-3)
         return super().advance(times, poses)
 
 
 def test_the_clock_of_the_bench_waits_for_a_simulation_that_is_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Wall time is counted in looks of 4 ms, so that a busy machine changes nothing."""
+    looks, ending = [0], threading.Event()
     monkeypatch.setattr(flowing_liquid, "arm_kind", lambda spec: Kind())
-    monkeypatch.setattr(bench_clock, "LONGEST_STAND", 0.25)
+    monkeypatch.setattr(bench_clock, "LONGEST_STAND", 0.1)
+    monkeypatch.setattr(bench_clock, "time", SimpleNamespace(monotonic=lambda: 4e-3 * looks[0]))
     SharedClock.create(tmp_path / "clock")
-    clock, ending = SharedClock(tmp_path / "clock"), threading.Event()
+    clock = SharedClock(tmp_path / "clock")
 
-    def advance() -> None:
-        while not ending.wait(0.004):
+    def control() -> None:
+        while not ending.wait(1e-3):
             clock.advance(0.008 if clock.may_pass(0.008) else 0.0)
+            looks[0] += 1
 
     def history(since: float) -> Motion:
         now = clock.now
         times = tuple(float(t) for t in np.arange(max(since, now - 60.0), now, 0.008)[1:])
         return Motion(times, ((0.0,) * 6,) * len(times), now)
 
-    thread = threading.Thread(target=advance, daemon=True)
+    thread = threading.Thread(target=control, daemon=True)
     thread.start()
-    drips, arm = LateDrips(), UrArmSettings.model_construct(clock=str(tmp_path / "clock"))
-    begun = clock.now
+    drips, arm = LateDrips(looks=lambda: looks[0]), UrArmSettings.model_construct(clock=str(tmp_path / "clock"))
     liquid = FlowingLiquid(FlowOrder(DOSE, 0.1), arm, history, lambda load: None, drips)  # type: ignore[arg-type]
+    begun = liquid._begun
     try:
-        wait_for(lambda: clock.now - begun > 0.3, "the clock goes on without the first step, which takes too long")
+        wait_for(lambda: clock.now - begun > 0.12, "the clock goes on without the first step, which takes too long")
         wait_for(lambda: clock.now - begun - (drips.moments or [0.0])[-1] < 0.1, "the simulation catches up")
-        for _ in range(20):
+        for _ in range(8):
             done = drips.moments[-1]
             wait_for(lambda: drips.moments[-1] > done, "the simulation goes on")  # noqa: B023
-            assert clock.now - begun - drips.moments[-1] < 0.15
+            assert clock.now - begun - drips.moments[-1] < 0.2
     finally:
+        liquid.end()
         ending.set()
         thread.join()
-        liquid.end()

@@ -127,9 +127,7 @@ def test_the_log_has_its_zone() -> None:
     stream = io.StringIO()
     root = logging.getLogger()
     handlers, level = root.handlers, root.level
-    try:
-        log_lines(stream)
+    with log_lines(stream):
         logging.getLogger("decant").warning("a line")
-    finally:
-        root.handlers, root.level = handlers, level  # type: ignore[misc]
+    assert (root.handlers, root.level) == (handlers, level)
     assert datetime.fromisoformat(json.loads(stream.getvalue())["time"]).utcoffset() == timedelta(0)
