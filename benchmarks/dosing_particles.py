@@ -7,9 +7,10 @@ The bench, its balance and its arm are those of benchmarks/dosing.py; cup, recei
 (`actors.dosing.particle_liquid`). Each series is five doses of 10 to 100 g (2 to 10 g in the row 'small amounts'),
 log-uniform, from a source that is 40 to 90 % full and is filled again when it holds too little. The receiver stands
 where the row's placement says; the grip's error is drawn as on the formula's bench. A source that is no straight cup
-begins with what a simulated dose has shown, as in a run. Development used the seeds below 8000; the final ones begin at
-8012. A source filled to the brim has 8,000 particles: with 4,000, half of which are mirror images, a fine flow of 8 g/s
-is some thirty pairs of particles a second, and their number alone scatters.
+begins with what a simulated dose has shown, as in a run. Development used the seeds below 8000; the final ones up to
+8019 are used up, and the next ones begin at 8020. A source filled to the brim has 8,000 particles: with 4,000, half of
+which are mirror images, a fine flow of 8 g/s is some thirty pairs of particles a second, and their number alone
+scatters.
 
 The run may be interrupted: `--into FILE` appends each finished series to a file as a line of JSON, and the next run
 with this file makes the others. The first series of all rows come first, then the second ones. `--json` writes the
@@ -59,7 +60,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from dosing import CUPS, OIL, PARTICLES, ROOT, cup_spec
 
 DATA = ROOT / "docs" / "data" / "dosing-particles.json"
-FIRST_SEED, FIRST_FINAL_SEED, SERIES, DOSES = 7000, 8012, 8, 5
+FIRST_SEED, FIRST_FINAL_SEED, SERIES, DOSES = 7000, 8020, 8, 5
 AMOUNTS, SMALL = (0.01, 0.1), (0.002, 0.01)
 FALL = 0.15
 GLYCEROL = {"name": "glycerol 50 %", "density": 1126.0, "dynamic_viscosity": 6e-3, "surface_tension": 0.068}
