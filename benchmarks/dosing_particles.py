@@ -1,16 +1,15 @@
 """Pour doses of particles in closed loop: the dose controller decides, and meets a liquid that it was not written for.
 
-    python benchmarks/dosing_particles.py --final --into FILE --json   # the page's docs/data/dosing-particles.json
+    python benchmarks/dosing_particles.py --first 8012 --into FILE --json   # the page's docs/data/dosing-particles.json
     python benchmarks/dosing_particles.py --rows mug --series 2
 
 The bench, its balance and its arm are those of benchmarks/dosing.py; cup, receiver and stream are simulated
 (`actors.dosing.particle_liquid`). Each series is five doses of 10 to 100 g (2 to 10 g in the row 'small amounts'),
 log-uniform, from a source that is 40 to 90 % full and is filled again when it holds too little. The receiver stands
 where the row's placement says; the grip's error is drawn as on the formula's bench. A source that is no straight cup
-begins with what a simulated dose has shown, as in a run. Development used the seeds below 8000; the final ones up to
-8019 are used up, and the next ones begin at 8020. A source filled to the brim has 8,000 particles: with 4,000, half of
-which are mirror images, a fine flow of 8 g/s is some thirty pairs of particles a second, and their number alone
-scatters.
+begins with what a simulated dose has shown, as in a run. Development used the seeds below 8000; final ones are used
+once, and those up to 8021 are used up. A source filled to the brim has 8,000 particles: with 4,000, half of which are
+mirror images, a fine flow of 8 g/s is some thirty pairs of particles a second, and their number alone scatters.
 
 The run may be interrupted: `--into FILE` appends each finished series to a file as a line of JSON, and the next run
 with this file makes the others. The first series of all rows come first, then the second ones. `--json` writes the
@@ -60,7 +59,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from dosing import CUPS, OIL, PARTICLES, ROOT, cup_spec
 
 DATA = ROOT / "docs" / "data" / "dosing-particles.json"
-FIRST_SEED, FIRST_FINAL_SEED, SERIES, DOSES = 7000, 8020, 8, 5
+FIRST_SEED, SERIES, DOSES = 7000, 8, 5
 AMOUNTS, SMALL = (0.01, 0.1), (0.002, 0.01)
 FALL = 0.15
 GLYCEROL = {"name": "glycerol 50 %", "density": 1126.0, "dynamic_viscosity": 6e-3, "surface_tension": 0.068}
@@ -286,16 +285,15 @@ def write(series: dict[tuple[str, int], list[Dose]], names: Sequence[str]) -> No
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--final", action="store_true", help="use the final seeds instead of the development seeds")
     parser.add_argument("--series", type=int, default=SERIES, help=f"number of series of {DOSES} doses of each row")
-    parser.add_argument("--first", type=int, default=FIRST_SEED, help="first development seed")
+    parser.add_argument("--first", type=int, default=FIRST_SEED, help="first seed")
     parser.add_argument("--rows", nargs="*", choices=list(ROWS), default=list(ROWS), help="sources and placements")
     parser.add_argument("--workers", type=int, default=2, help="number of processes")
     parser.add_argument("--into", type=Path, help="file of finished series, which are not made again")
     parser.add_argument("--json", action="store_true", help=f"write {DATA.relative_to(ROOT)}")
     options = parser.parse_args()
-    first = FIRST_FINAL_SEED if options.final else options.first
-    wanted = [(name, seed) for seed in range(first, first + options.series) for name in options.rows]
+    seeds = range(options.first, options.first + options.series)
+    wanted = [(name, seed) for seed in seeds for name in options.rows]
     series = finished(options.into)
     with ProcessPoolExecutor(options.workers) as pool:
         jobs = {pool.submit(loss_series, *key): key for key in wanted if key not in series}

@@ -577,7 +577,7 @@ def dosing_particles() -> str:
         for name, row in rows.items()
     ]
     how = f"five doses of each seed; {data['machine']['date']}"
-    command = "python benchmarks/dosing_particles.py --final --into FILE --json"
+    command = "python benchmarks/dosing_particles.py --first SEED --into FILE --json"
     return f"{_table(head, lines)}\n<sub>`{command}`; {how}.</sub>\n"
 
 

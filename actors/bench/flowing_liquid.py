@@ -42,9 +42,9 @@ LATEST, LATEST_PARTICLES = 0.08, 0.04
 """Time from one reading to the next one [s of the clock], for which the clock of the bench waits; with particles, whose
 simulation may be slower than the clock, it is the time by which the balance sees the liquid late."""
 
-SLICE = 5
-"""Samples of the arm's motion after which the promise is renewed: however slow the simulation, the clock of the bench
-waits until it has caught up."""
+SLICE = 10
+"""Samples of the arm's motion after which the promise is renewed, more than there are without a delay: however slow the
+simulation, the clock of the bench waits until it has caught up."""
 
 SILENCE = 30.0
 """Time without an answer of the arm's emulator after which nothing flows any more [s]: the emulator has ended."""
@@ -208,7 +208,7 @@ class FlowingLiquid:
             self._flow = ParticleFlow(order.liquid, pours, pose, watched=order.watched)
             self._latest = LATEST_PARTICLES
         self._bench_clock = device_clock(arm.clock)
-        self._begun = self._since = self._clock = history(1e12).now  # a process may have been started before
+        self._begun = self._clock = history(1e12).now  # a process may have been started before
         self._tilt = 0.0
         self._problem: LaboratoryError | None = None
         self._upright_since: float | None = None
@@ -267,11 +267,12 @@ class FlowingLiquid:
 
     def _follow(self) -> None:
         """Pour along the motion since the last call."""
-        changes = self._history(self._since)
-        fresh = [(t, q) for t, q in zip(changes.times, changes.joints, strict=True) if self._since < t <= changes.now]
+        changes = self._history(self._clock)
+        fresh = [(t, q) for t, q in zip(changes.times, changes.joints, strict=True) if self._clock < t <= changes.now]
         if not fresh or self._problem is not None:
             return
-        times = np.array([t for t, _ in fresh]) - self._begun
+        moments = [t for t, _ in fresh]
+        times = np.array(moments) - self._begun
         poses = self._poses(np.array([q for _, q in fresh]))
         for first in range(0, len(times), SLICE):
             some = slice(first, first + SLICE)
@@ -280,7 +281,7 @@ class FlowingLiquid:
             except LaboratoryError as problem:
                 self._problem = problem
                 return
-            self._since = self._clock = fresh[: first + SLICE][-1][0]
+            self._clock = moments[some][-1]
             self._tilt = float(_tilts(poses[some][-1:])[0])
             if self._tilt > 0.02:
                 self._upright_since = None

@@ -171,18 +171,16 @@ class SharedClock(DeviceClock):
         The clock waits neither for a process that has ended nor longer than `LONGEST_STAND` of wall time for one that
         does not renew its promise.
         """
-        after, wall = self._numbers[_NOW] + seconds, time.monotonic()
-        promised = {program: self._numbers[_place(program)] for program in PROGRAMS}
-        before = self._late
-        self._late = {
-            program: before[program] if before.get(program, (math.nan, wall))[0] == moment else (moment, wall)
-            for program, moment in promised.items()
-            if moment < after
-        }
-        for program, (_, since) in self._late.items():
-            if wall - since > LONGEST_STAND or not _lives(int(self._numbers[_place(program) + 1])):
+        after, before = self._numbers[_NOW] + seconds, self._late
+        late = [program for program in PROGRAMS if self._numbers[_place(program)] < after]
+        self._late = {}
+        for program in late:
+            promised, wall = self._numbers[_place(program)], time.monotonic()
+            same, since = before.get(program, (math.nan, wall))
+            self._late[program] = (promised, since if same == promised else wall)
+            if wall - self._late[program][1] > LONGEST_STAND or not _lives(int(self._numbers[_place(program) + 1])):
                 self.withdraw(program)
-        return not self._late
+        return not late
 
 
 def _place(program: str) -> int:

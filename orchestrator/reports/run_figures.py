@@ -347,7 +347,7 @@ def draw_dose(dose: Dose) -> Figure:
     """
     signals = dose.signals
     figure, axes = style.new_figure(2, 1, size=(6.4, 4.8), sharex=True)
-    received = "unknown" if dose.received_g is None else f"{dose.received_g:.1f} g received"
+    received = "unknown" if dose.received_g is None else f"{dose.received_g:.2f} g received"
     style.entitle(figure, f"Dose {dose.number}: {dose.wanted_g:g} g wanted, {received}")
     times, readings = np.array(signals.read_at), np.array(signals.readings_g)
     if dose.duration_s is not None:  # later readings are of another load, once an arm takes the receiver away

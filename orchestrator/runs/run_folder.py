@@ -203,7 +203,9 @@ def read_film(path: Path) -> SimulatedPour:
         OSError, ValueError: it can't be read.
     """
     with np.load(path) as archive:
-        x, y, z = archive["receiver_at"].tolist() if "receiver_at" in archive else (0.0, 0.0, 0.0)  # before 0.3
+        x, y, z = (
+            archive["receiver_at"].tolist() if "receiver_at" in archive else (0.0, 0.0, 0.0)
+        )  # films of 0.2 lack it
         particles = list(archive["positions"]), list(archive["states"])
         frames = RecordedFrames(archive["times"], *particles, archive["poses"], (x, y, z))
         return SimulatedPour(from_json(json.loads(str(archive["outcome"])), PourOutcome), frames)

@@ -275,7 +275,7 @@ class LateDrips(Drips):
     looks: Callable[[], int] = lambda: 0
 
     def advance(self, times: NDArray[np.float64], poses: NDArray[np.float64]) -> LiveState:
-        end = self.looks() + (3 * len(times) if self.moments else 45)
+        end = self.looks() + (2 * len(times) if self.moments else 45)
         wait_for(lambda: self.looks() >= end, "the controller looks at its clock", poll=1e-3)
         return super().advance(times, poses)
 
