@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import Json
+from orchestrator.cli.command_options import Json, OtherLaboratory
 from orchestrator.cli.console import (
     FAILED,
     RefusalError,
@@ -31,8 +31,12 @@ def validate(
     files: Annotated[
         list[Path], typer.Argument(help="Campaign, study, vessel, laboratory, daemon or recording files.")
     ],
+    laboratory: OtherLaboratory = None,
 ) -> None:
-    """Check files without starting anything: keys, units, bounds, vessels, and whether some action can be poured."""
+    """Check files without starting anything: keys, units, bounds, vessels, and whether some action can be poured.
+
+    With --laboratory, campaigns are checked as 'decant run' would run them there.
+    """
     from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from sim_engine.vessel.shapes import VesselError
 
@@ -40,7 +44,7 @@ def validate(
     for path in files:
         try:
             with WaitingIndicator() as doing:
-                note, problems = _checked(path, doing)
+                note, problems = _checked(path, laboratory, doing)
         except ConfigError as error:
             problems = [str(error)]
         except VesselError as error:
@@ -54,7 +58,7 @@ def validate(
         raise RefusalError(f"{bad} of {len(files)} file(s) can't be used")
 
 
-def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
+def _checked(path: Path, laboratory: Path | None, doing: WaitingIndicator) -> tuple[str, list[str]]:
     """Return a short description of a file, and its problems.
 
     Raises:
@@ -88,7 +92,7 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             from orchestrator.campaigns.campaign_checks import check_campaign
             from orchestrator.cli.dose_command import show_flows
 
-            plan = load_campaign(path, posteriors=_posteriors)
+            plan = load_campaign(path, laboratory, posteriors=_posteriors)
             for line in () if plan.memory is None else plan.memory.lines:
                 print_note(line)
             warned: list[str] = []

@@ -245,7 +245,7 @@ async def settle_unknown_pours(
                     "because on a real one the liquid may be in the receiver already. Set on_unknown: ask"
                 )
             text = f"{subject} had begun and has no outcome; it is repeated with the same seed on the virtual bench"
-            journal.log("note", text, stage=stage, kept=True)
+            journal.log("info", text, stage=stage, kept=True)
             continue
         options = (*((REPEAT,) if virtual else ()), LOST, WEIGHED if pour.dose is None else RECEIVED)
         facts = unknown_pour_facts(pour, scene, history.readings.get(key))

@@ -291,7 +291,7 @@ class StageScheduler:
                         text = (
                             f"{error.problem}. The virtual bench was restarted, and pour {request.number} is repeated"
                         )
-                        self._journal.log("note", text, stage=self._stage, kept=True)
+                        self._journal.log("info", text, stage=self._stage, kept=True)
                         pending.attempt += 1
             case Suggest():
 

@@ -131,3 +131,16 @@ def test_a_stored_calibration_that_does_not_fit_is_named(
     result = invoke(f"validate {rig}")
     assert result.exit_code == 2
     assert message in " ".join(result.stderr.split())
+
+
+def test_a_campaign_is_checked_on_the_laboratory_where_it_would_run(tmp_path: Path) -> None:
+    other = tmp_path / "low.yaml"
+    text = (ROOT / "configs/laboratories/virtual.yaml").read_text(encoding="utf-8")
+    assert "z: 900 mm}" in text
+    other.write_text(text.replace("z: 900 mm}", "z: 90 mm}"), encoding="utf-8")
+    campaign = ROOT / "configs/campaigns/dispense.yaml"
+    assert invoke(f"validate {campaign}").exit_code == 0
+    result = invoke(f"validate {campaign} --laboratory {other}")
+    assert result.exit_code == 2
+    assert "low.yaml" in result.stderr
+    assert "box" in result.stderr

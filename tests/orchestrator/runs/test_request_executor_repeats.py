@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from actors.interfaces import BenchLostError, LaboratoryError, LinkLostError, UnknownPourError
 from orchestrator.learning.requests import Poured
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.reports.console_progress import ProgressDisplay
 from orchestrator.runs.request_executor import (
     Deadlines,
     PourNotMadeError,
@@ -49,14 +52,17 @@ def notes(directory: Path) -> list[str]:
 def test_a_pour_is_made_again_with_one_line_if_the_link_was_lost_before_anything_flowed(
     tmp_path: Path, on_unknown: str
 ) -> None:
-    laboratory, script = failing(LOST), Script(pour(1), pour(2))
-    run(tmp_path, laboratory, plan=toy_plan(tmp_path, on_unknown=on_unknown), stages=one_stage(script))
+    laboratory, script, printed = failing(LOST), Script(pour(1), pour(2)), StringIO()
+    plan = toy_plan(tmp_path, on_unknown=on_unknown)
+    with ProgressDisplay(plan, console=Console(file=printed, width=400)) as display:
+        run(tmp_path, laboratory, plan=plan, stages=one_stage(script), subscribers=[display])
     assert [type(outcome) for _, outcome in script.told] == [Poured, Poured]
     assert laboratory.bench is not None
     assert laboratory.bench.received == [101, 101, 102], "with the same seed"
     assert laboratory.restarts == 1
     (line,) = notes(tmp_path)
     assert "connection to the controller was lost" in line
+    assert line in printed.getvalue().splitlines()
     with JournalReader(tmp_path / JOURNAL_NAME) as journal:
         kinds = [Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED]
         entries = [(e.kind, e.body.get("attempt")) for e in journal.entries(kinds=kinds)][:3]
