@@ -9,7 +9,7 @@
 
 The busy processes have normal priority, run on the same cores, and end with this process. `--one-core` keeps
 everything on the first permitted core. Each run's exit code and time are printed; the time is not judged. The exit
-code is 1 if a run ended with another code than 0.
+code is 1 if a run ended with another code than 0; the folder of such a run is kept.
 """
 
 from __future__ import annotations
@@ -62,8 +62,7 @@ class Run:
 
     def __post_init__(self) -> None:
         """Start it."""
-        self._folder = tempfile.TemporaryDirectory(prefix="decant-busy-")
-        folder = Path(self._folder.name)
+        self._folder = folder = Path(tempfile.mkdtemp(prefix="decant-busy-"))
         shutil.copytree(ROOT / "configs", folder / "configs")
         words = [str(folder / "configs" / word) if word.endswith(".yaml") else word for word in COMMANDS[self.name]]
         command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "run", *words]
@@ -81,9 +80,10 @@ class Run:
         return self._child.poll() is not None
 
     def result(self) -> tuple[int, float, str]:
-        """Exit code, time [s] and messages of a run that has ended; its folder is removed."""
+        """Exit code, time [s] and messages of a run that has ended; its folder is removed unless it failed."""
         seconds, text = time.monotonic() - self._begin, self._output.read_text(encoding="utf-8").strip()
-        self._folder.cleanup()
+        if self._child.returncode == 0:
+            shutil.rmtree(self._folder, ignore_errors=True)
         return self._child.returncode, seconds, text
 
 

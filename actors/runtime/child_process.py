@@ -44,13 +44,15 @@ _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 _SHORTEST_SLICE = 100_000
 """Shortest time slice that Linux grants [ns]."""
 
+START_DEADLINE = 600.0
+"""Longest time for a program to get ready [s]: a busy machine needs long, and one that fails ends before."""
+
 GRACE = 10.0
 """Default time for a child to end by itself [s]."""
 
 _ERRORS_KEPT = 2000
 _PR_SET_PDEATHSIG = 1
 
-_LINES_SHOWN = 3
 _CRASHES = ("*** SIG", "Fatal Python error")
 
 _hidden: dict[str, str | None] = {}
@@ -97,12 +99,12 @@ def _set_environment(values: Mapping[str, str | None]) -> None:
             os.environ[name] = value
 
 
-def last_lines(text: str) -> str:
+def last_lines(text: str, count: int = 3) -> str:
     """The last lines of a program's messages as one line, for an error; a crash's stack is left out."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     crash = next((n for n, line in enumerate(lines) if line.startswith(_CRASHES)), len(lines))
     del lines[crash + 1 :]
-    return " / ".join(lines[-_LINES_SHOWN:])
+    return " / ".join(lines[-count:])
 
 
 def python_module(module: str, *arguments: str) -> list[str]:

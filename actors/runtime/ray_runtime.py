@@ -41,15 +41,15 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from actors.interfaces import LaboratoryError
-from actors.runtime.child_process import ChildProcess, own_environment, python_module
+from actors.runtime.child_process import START_DEADLINE, ChildProcess, own_environment, python_module
 from actors.runtime.ray_cleanup import GOODBYE, MARK, end_cluster
 
 if TYPE_CHECKING:
     import psutil  # type: ignore[import-untyped,unused-ignore]  # its stubs are a package of their own
 
-START_DEADLINE, JOIN_DEADLINE = 600.0, 120.0
-"""Longest time that a private Ray may take to start, and the connection to a running one [s]: three on an idle machine,
-more than 120 on one core next to twenty other programs.
+JOIN_DEADLINE = 120.0
+"""Longest time that the connection to a running Ray may take [s]. A private one has `START_DEADLINE`: it starts within
+3 s on an idle machine, and within more than 120 s on one core next to twenty other programs.
 """
 
 LOOK_INTERVAL = 2.0

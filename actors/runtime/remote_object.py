@@ -17,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Protocol
 
 from actors.interfaces import BenchLostError, LaboratoryError
+from actors.runtime.child_process import START_DEADLINE, last_lines
 
 if TYPE_CHECKING:
     from actors.runtime.ray_cluster import PinnedNode
@@ -59,9 +60,6 @@ LOOK_INTERVAL = 20.0
 
 LOOK_DEADLINE = 60.0
 """A process that has replied before counts as lost if it does not reply for this time [s]."""
-
-START_DEADLINE = 600.0
-"""Longest time for a process to start [s]; a busy machine needs long. Deadlines of calls begin after it."""
 
 
 class DeviceLostError(LaboratoryError):
@@ -194,6 +192,8 @@ class RayDevice:
         except ray.exceptions.RayActorError as error:
             self._lost = True
             await self._check_machine(method)
+            if error.actor_init_failed:  # Ray's text is that of the constructor's traceback
+                raise DeviceLostError(f"{self.name}: did not start: {last_lines(str(error), 1)}") from error
             raise DeviceLostError(f"{self.name}: its process died during '{method}'") from error
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, LaboratoryError | ValueError):

@@ -24,6 +24,7 @@ from functools import partial
 from typing import Protocol
 
 from actors.interfaces import LaboratoryError, SimulationError
+from actors.runtime.child_process import START_DEADLINE
 from actors.runtime.remote_object import mark_retrieved
 from sim_engine.outcome import SimulatedPour
 from sim_engine.scene import PourTask
@@ -33,9 +34,6 @@ RETRIES = 2
 
 DEADLINE = 1800.0
 """Longest time for one job on one worker [s]: a worker that needs half an hour counts as dead, not slow."""
-
-START_DEADLINE = 120.0
-"""Longest time that jobs wait while no worker is up [s]."""
 
 DRAIN_DEADLINE = 10.0
 """Time that a cancelled job has to stop [s]; after that its worker is replaced."""

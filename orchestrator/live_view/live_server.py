@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import Self
 from urllib.parse import quote
 
-from actors.runtime.child_process import ChildProcess, python_module
+from actors.runtime.child_process import START_DEADLINE, ChildProcess, python_module
 from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.viewer_server import environment
 
@@ -35,7 +35,6 @@ STREAM_PORT = 9876
 MEMORY = "512MiB"
 """Memory for viewers that connect late; older data are in the recording on disk."""
 
-_START_TIME = 40.0
 _TRIED = 100
 
 
@@ -96,7 +95,7 @@ class LiveView:
 
     def _await_ports(self) -> None:
         assert self._process is not None
-        end = time.monotonic() + _START_TIME
+        end = time.monotonic() + START_DEADLINE
         wanted = list(self._ports)
         while wanted:
             if not self._process.alive or time.monotonic() > end:
@@ -127,7 +126,7 @@ class LiveView:
     def server_pid(self) -> int:
         """Process id of Rerun's server. Read it only once, since it is the first line of the server's output."""
         assert self._process is not None
-        return int(self._process.read_line(_START_TIME))
+        return int(self._process.read_line(START_DEADLINE))
 
     @property
     def alive(self) -> bool:

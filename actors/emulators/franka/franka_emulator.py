@@ -15,14 +15,13 @@ from actors.arm.arm_settings import History
 from actors.arm.franka.franka_arm import FrankaSettings
 from actors.interfaces import LaboratoryError
 from actors.runtime.bench_clock import PATIENCE, SharedClock
-from actors.runtime.child_process import ChildProcess, python_module
+from actors.runtime.child_process import START_DEADLINE, ChildProcess, python_module
 from actors.runtime.ray_cleanup import MARK
 from actors.runtime.remote_object import DeviceLostError
 from sim_engine.resources import require
 
-START_TIME = 30.0 * PATIENCE
 REPLY_TIME = 5.0 * PATIENCE
-"""Longest waits for the process [s]."""
+"""Longest wait for a reply of the process [s]."""
 
 FAULTS = ("trip", "mend", "unplug", "plug")
 
@@ -56,7 +55,7 @@ class FrankaEmulator:
             prompt=True,
         )
         try:
-            json.loads(self._process.read_line(START_TIME))
+            json.loads(self._process.read_line(START_DEADLINE))
         except (OSError, ValueError, EOFError, TimeoutError) as error:
             reason = self._process.last_error or str(error)
             self.close()

@@ -18,11 +18,11 @@ from actors.balance.balance_settings import AUTO, BalanceSettings, SerialBalance
 from actors.balance.dialect_registry import encoders
 from actors.balance.scale_model import Load, ScaleSettings
 from actors.interfaces import LaboratoryError
-from actors.runtime.child_process import ChildProcess, python_module
+from actors.runtime.child_process import START_DEADLINE, ChildProcess, python_module
 from actors.runtime.ray_cleanup import MARK
 
 REPLY_TIMEOUT = 120.0
-"""Longest wait for the process to start, or to reply [s]."""
+"""Longest wait for the process to reply [s]."""
 
 GRACE = 10.0
 """Longest wait for the process to end by itself [s]."""
@@ -54,7 +54,7 @@ class FarProcess:
         text = json.dumps({**settings, "link": self._link, "baud": baud, "tcp": tcp})
         self._process = ChildProcess(python_module(self.module, text), prompt=True)
         try:
-            self.port = self._answer()["port"]
+            self.port = self._answer(START_DEADLINE)["port"]
         except BaseException:
             self.close()
             raise
@@ -92,11 +92,11 @@ class FarProcess:
             Path(self._link).unlink(missing_ok=True)
             Path(self._link).parent.rmdir()
 
-    def _answer(self) -> dict[str, Any]:
+    def _answer(self, within: float = REPLY_TIMEOUT) -> dict[str, Any]:
         try:
-            answer: dict[str, Any] = json.loads(self._process.read_line(REPLY_TIMEOUT))
+            answer: dict[str, Any] = json.loads(self._process.read_line(within))
         except TimeoutError:
-            raise LaboratoryError(f"virtual balance at {self.port}: no answer within {REPLY_TIMEOUT:g} s") from None
+            raise LaboratoryError(f"virtual balance at {self.port}: no answer within {within:g} s") from None
         except (EOFError, OSError, ValueError):
             raise LaboratoryError(f"virtual balance at {self.port}: its process has ended{self._end()}") from None
         if "error" in answer:

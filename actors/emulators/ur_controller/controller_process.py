@@ -13,10 +13,7 @@ from math import degrees
 from types import TracebackType
 from typing import Any
 
-from actors.runtime.child_process import ChildProcess, python_module
-
-START_TIME = 120.0
-"""Longest wait until the process is ready [s]."""
+from actors.runtime.child_process import START_DEADLINE, ChildProcess, python_module
 
 REPLY_TIME = 50.0
 """Longest wait for a reply of the process [s], on a machine that may be busy."""
@@ -55,7 +52,7 @@ class VirtualController:
         polyscope_x: bool = False,
         joints: Sequence[float] | None = None,
         clock: str = "",
-        timeout: float = START_TIME,
+        timeout: float = START_DEADLINE,
     ) -> VirtualController:
         """Start the process and wait until all its ports are open.
 

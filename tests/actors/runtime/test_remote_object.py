@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from actors.interfaces import LaboratoryError
 from actors.runtime import remote_object as device
 from actors.runtime.remote_object import DeviceLostError, LocalDevice, RayDevice
 
@@ -98,3 +99,24 @@ async def test_a_process_that_never_starts_is_lost(
     with pytest.raises(DeviceLostError, match="balance: no answer to 'value'"):
         await balance.call("value", deadline=60.0)
     await balance.close()
+
+
+class Broken:
+    """Its constructor fails."""
+
+    def __init__(self) -> None:
+        raise LaboratoryError("virtual controller at 127.0.0.2: not ready")
+
+    def value(self) -> int:
+        return 5
+
+
+@pytest.mark.ray
+async def test_a_process_that_does_not_start_says_why(ray_running: None) -> None:
+    import ray
+
+    ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers can't import test modules
+    bench = RayDevice("emulators", Broken)
+    with pytest.raises(DeviceLostError, match=r"emulators: did not start: .*controller at 127\.0\.0\.2: not ready"):
+        await bench.call("value", deadline=60.0)
+    await bench.close()
