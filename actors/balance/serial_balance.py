@@ -53,11 +53,11 @@ from actors.balance.serial_port import Counters, PortLostError, Tap, Wire
 from actors.runtime.bench_clock import device_clock
 
 _REOPEN_INTERVAL = 0.2
-_GLANCE = 0.1
 
-LATEST = 0.2
-"""Time between two looks at the line during a weighing, for which the clock of a virtual bench waits [s of bench time].
-Otherwise a busy host would leave room for a few readings only until a weight must have settled."""
+LATEST, _GLANCE = 0.2, 0.02
+"""Longest times between two looks at the line during a weighing [s of bench time, s of the clock]; the clock of a
+virtual bench waits for the next one. Otherwise a busy host would leave room for a few readings only until a weight must
+have settled, and a dose would see its last grams late."""
 
 
 class Conversation:
@@ -246,7 +246,7 @@ class Conversation:
         """Return the next line; checks for an interruption while waiting."""
         while not self._interrupted.is_set():
             left = end - self.clock.now
-            glance = min(left, _GLANCE, LATEST / self.time_scale)
+            glance = min(left, self._latest)
             self._promise(glance)
             line = wire.line_until(time.monotonic() + glance)
             if line is not None or left <= 0.0:
@@ -255,7 +255,11 @@ class Conversation:
 
     def _promise(self, wait: float) -> None:
         """Let the clock of a virtual bench stand if this thread is late after a wait [s of the clock]."""
-        self.clock.promise("weighing", wait + LATEST / self.time_scale)
+        self.clock.promise("weighing", wait + self._latest)
+
+    @property
+    def _latest(self) -> float:
+        return min(_GLANCE, LATEST / self.time_scale)
 
     def _decoded(self, line: bytes) -> Reply | None:
         try:

@@ -59,7 +59,7 @@ from sim_engine.scene import Scene
 TICK = 0.05
 """Time between two decisions [s]."""
 
-LATEST_COMMAND = 0.12
+LATEST_COMMAND = 0.08
 """Time from one command to the next one [s of the clock], for which the clock of a virtual bench waits."""
 
 LOOK_INTERVAL = 0.01

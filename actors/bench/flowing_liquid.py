@@ -38,9 +38,9 @@ Floats = NDArray[np.float64]
 INTERVAL = 0.02
 """Time between two readings of the arm [s]."""
 
-LATEST, LATEST_PARTICLES = 0.08, 0.04
-"""Time from one reading to the next one [s of the clock], for which the clock of the bench waits; with particles, whose
-simulation may be slower than the clock, it is the time by which the balance sees the liquid late."""
+LATEST = 0.04
+"""Time from one reading to the next one [s of the clock], for which the clock of the bench waits: the balance may see
+the liquid late by as much, also on a busy host or where its simulation is slower than the clock."""
 
 SLICE = 10
 """Samples of the arm's motion after which the promise is renewed, more than there are without a delay: however slow the
@@ -197,7 +197,6 @@ class FlowingLiquid:
         if self._kind.figure() is None:
             raise LaboratoryError(f"an arm of the kind '{arm.kind}' has no figure: its joints give no tilt")
         self._flow: _FormulaFlow | ParticleFlow
-        self._latest = LATEST
         if isinstance(order.liquid, FormulaLiquid):
             self._flow = _FormulaFlow(order, order.liquid)
         else:
@@ -206,7 +205,6 @@ class FlowingLiquid:
                 raise LaboratoryError("the emulator of the arm does not report where the arm stands")
             pose = self._poses(np.array(recent))[0]
             self._flow = ParticleFlow(order.liquid, pours, pose, watched=order.watched)
-            self._latest = LATEST_PARTICLES
         self._bench_clock = device_clock(arm.clock)
         self._begun = self._clock = history(1e12).now  # a process may have been started before
         self._tilt = 0.0
@@ -215,7 +213,7 @@ class FlowingLiquid:
         self._signals: list[tuple[float, float, float]] = []
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="liquid", daemon=True)
-        self._bench_clock.promise("liquid", self._latest)
+        self._bench_clock.promise("liquid", LATEST)
         self._thread.start()
 
     def frames(self) -> RecordedFrames | None:
@@ -259,7 +257,7 @@ class FlowingLiquid:
                     if time.monotonic() - answered > SILENCE:
                         return
                 spent = time.monotonic() - begun
-                self._bench_clock.promise("liquid", self._latest)
+                self._bench_clock.promise("liquid", LATEST)
                 if self._problem is not None or self._clock - self._begun > 20.0 * LONGEST_DOSE:
                     return
         finally:
@@ -289,7 +287,7 @@ class FlowingLiquid:
                 self._upright_since = self._clock
             self._signals.append((self._clock - self._begun, self._tilt, self._flow.received))
             self._put(self._order.base + load + self._spilled)
-            self._bench_clock.promise("liquid", self._latest - (changes.now - self._clock))
+            self._bench_clock.promise("liquid", LATEST - (changes.now - self._clock))
 
     def _poses(self, joints: Floats) -> Floats:
         """True poses of the pourer, (T, 7); a formula has its own error of the grip."""

@@ -68,8 +68,9 @@ BEAT_INTERVAL, TELL_INTERVAL, LOOK_INTERVAL = 0.02, 0.05, 0.002
 FORCE_INTERVAL = 0.1
 """Time between two recorded forces [s of the path]."""
 
-LATEST = 0.1
-"""Time from one new package to the next one [s of the clock], for which the clock of a virtual bench waits."""
+LATEST = 0.03
+"""Time from one new package to the next one [s of the clock], for which the clock of a virtual bench waits. The
+commands of a dose are late by as much."""
 
 OWNER_SILENCE = 3.0
 """Time without a sign of life after which the driver counts as dead [s of the clock]."""

@@ -233,7 +233,7 @@ SHORTEST_WAIT = 0.001
 _LONGEST_WAIT = 0.05
 """Longest wait of the server, in which it also checks whether its parent is alive [s]."""
 
-_LATEST = 0.05
+_LATEST = 0.02
 """Time after a wait within which the server acts [s]: a clock that it shares waits for a late one."""
 
 

@@ -228,8 +228,8 @@ class Host:
             self.controller.tick()
 
 
-HUNG = 20.0
-"""Wall time after which a process with a blocked interpreter is ended [s]."""
+HUNG = 300.0
+"""Wall time after which a process with a blocked interpreter is ended [s]; a busy host may let it wait long."""
 
 
 async def until_orphaned(parent: int, interval: float = 0.5, hung: float = HUNG) -> None:
