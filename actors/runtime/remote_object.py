@@ -12,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import re
 from collections.abc import Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Protocol
@@ -192,8 +193,9 @@ class RayDevice:
         except ray.exceptions.RayActorError as error:
             self._lost = True
             await self._check_machine(method)
-            if error.actor_init_failed:  # Ray's text is that of the constructor's traceback
-                raise DeviceLostError(f"{self.name}: did not start: {last_lines(str(error), 1)}") from error
+            if error.actor_init_failed:  # its text is a traceback, which ends with 'module.Error: why'
+                reason = re.sub(r"^[\w.]+Error: ", "", last_lines(str(error), 1))
+                raise DeviceLostError(f"{self.name}: did not start: {reason}") from error
             raise DeviceLostError(f"{self.name}: its process died during '{method}'") from error
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, LaboratoryError | ValueError):

@@ -117,6 +117,8 @@ async def test_a_process_that_does_not_start_says_why(ray_running: None) -> None
 
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers can't import test modules
     bench = RayDevice("emulators", Broken)
-    with pytest.raises(DeviceLostError, match=r"emulators: did not start: .*controller at 127\.0\.0\.2: not ready"):
+    with pytest.raises(
+        DeviceLostError, match=r"^emulators: did not start: virtual controller at 127\.0\.0\.2: not ready$"
+    ):
         await bench.call("value", deadline=60.0)
     await bench.close()
