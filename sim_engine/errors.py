@@ -41,6 +41,12 @@ class SimulationCancelled(Exception):  # noqa: N818 - a notification, not an err
     """The simulation was cancelled, because its result is not needed any more."""
 
 
+def reason_of(error: BaseException) -> str:
+    """The text of an error for the user: complete if it was raised deliberately; a defect's has its type before it."""
+    name, text = type(error).__name__, str(error)
+    return text if isinstance(error, DecantError) and text else f"{name}: {text}" if text else name
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str | None:
     """The known word that is most similar to a misspelt one, if any is."""
     candidates = list(known)

@@ -54,6 +54,7 @@ from orchestrator.learning.requests import (
 from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.resume import AskOperator
 from sim_engine.action import Action
+from sim_engine.errors import reason_of
 from sim_engine.outcome import RecordedFrames, SimulatedPour
 from sim_engine.scene import PourTask, Scene
 
@@ -521,7 +522,7 @@ class RequestExecutor:
                     async with asyncio.timeout(self.deadlines.suggest):
                         return Suggested(await self._laboratory.optimizer.suggest(request.query))
                 except Exception as error:
-                    reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+                    reason = reason_of(error)
                     if attempt == SUGGESTIONS or isinstance(error, BenchLostError):
                         times = "once" if attempt == 1 else f"{attempt} times"
                         raise RequestExecutorError(

@@ -56,6 +56,7 @@ from orchestrator.runs.run_folder import (
 )
 from orchestrator.runs.stage_scheduler import StageScheduler
 from orchestrator.runs.stages import StageDefinition, recommended_pours, scenes_of, stage_seed, stages_of
+from sim_engine.errors import reason_of
 from sim_engine.outcome import RecordedFrames
 from sim_engine.scene import Scene
 
@@ -163,7 +164,7 @@ class _RunEngine:
                 if self._is_finished():  # the results are complete; only the cleanup failed
                     self._journal.log("warning", f"while closing the laboratory: {error}")
                 else:
-                    self._come_to_rest(State.FAILED, f"{type(error).__name__}: {error}")
+                    self._come_to_rest(State.FAILED, reason_of(error))
                     raise
             return self._close()
         finally:

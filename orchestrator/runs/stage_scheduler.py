@@ -43,6 +43,7 @@ from orchestrator.records.journal import Journal
 from orchestrator.records.journal_file import JournalError
 from orchestrator.runs.request_executor import RequestExecutor, RequestExecutorError
 from orchestrator.runs.resume import StageHistory, replay, weighed_by_hand
+from sim_engine.errors import reason_of
 from sim_engine.outcome import RecordedFrames
 
 _DELIVERY_ORDER: dict[type[Request], int] = {Suggest: 0, Simulate: 1, Pour: 2, Ask: 3}
@@ -364,10 +365,7 @@ class StageScheduler:
 
         A second cancellation abandons the pour as well.
         """
-        if isinstance(error, asyncio.CancelledError):
-            reason = "asked to pause"
-        else:  # the text of a RunError is complete; for a defect the type matters
-            reason = str(error) if isinstance(error, RunError) else f"{type(error).__name__}: {error}"
+        reason = "asked to pause" if isinstance(error, asyncio.CancelledError) else reason_of(error)
         pours: list[asyncio.Task[None]] = []
         others: list[asyncio.Task[None]] = []
         for pending in self._pending.values():
@@ -397,4 +395,4 @@ class StageScheduler:
             await asyncio.wait(unfinished, timeout=self._executor.deadlines.cleanup)
         for task in (pending.task for pending in self._pending.values() if pending.task is not None):
             if task.done() and not task.cancelled() and (late := task.exception()) is not None and late is not error:
-                self._journal.log("warning", f"while winding down: {type(late).__name__}: {late}", stage=self._stage)
+                self._journal.log("warning", f"while winding down: {reason_of(late)}", stage=self._stage)

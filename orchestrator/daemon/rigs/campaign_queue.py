@@ -32,6 +32,7 @@ from orchestrator.daemon.state.daemon_store import (
 from orchestrator.learning.run_errors import RunError
 from orchestrator.reports.progress_state import CHECKPOINT_WORDS
 from orchestrator.runs.stages import POUR
+from sim_engine.errors import reason_of
 
 _log = logging.getLogger(__name__)
 
@@ -122,7 +123,7 @@ class CampaignQueue:
                 state, reason = REFUSED, str(error)
             except Exception as error:
                 _log.exception("the check of %s failed", item.id)
-                state, reason = REFUSED, f"the check failed: {type(error).__name__}: {error}"
+                state, reason = REFUSED, f"the check failed: {reason_of(error)}"
         now = self.item(item.id)
         if state == REFUSED and now.run is None:
             self._store.change(item.id, state=state, reason=reason, ended=time.time())

@@ -47,6 +47,7 @@ from orchestrator.runs.request_executor import PourUnknownError, RequestExecutor
 from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService
 from orchestrator.runs.stages import POUR
+from sim_engine.errors import reason_of
 
 _log = logging.getLogger(__name__)
 
@@ -576,7 +577,7 @@ class RigWorker:
             self._shared.suspect |= isinstance(error, LaboratoryError | RequestExecutorError)
             state, reason = ("paused" if needs_person else "failed"), str(error)
         except Exception as error:
-            state, reason = "failed", f"{type(error).__name__}: {error}"
+            state, reason = "failed", reason_of(error)
             _log.exception("campaign %s failed", item.id)
         if state in ("failed", "paused") and (lost := self._shared.warm.lost):
             # No fault of the campaign's, and no operator's: it continues when there is a Ray again.

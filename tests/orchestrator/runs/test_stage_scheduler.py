@@ -18,7 +18,7 @@ from actors.interfaces import InvalidActionError, LaboratoryError, PourProgress,
 from actors.runtime.remote_object import DeviceLostError
 from orchestrator.learning.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Slots
 from orchestrator.learning.run_errors import RunError
-from orchestrator.records.events import Event, LogLine, PourProgressed, RequestFinished
+from orchestrator.records.events import CampaignStateChanged, Event, LogLine, PourProgressed, RequestFinished
 from orchestrator.runs.request_executor import Deadlines, PourUnknownError, RequestExecutorError
 from tests.support.scripted_strategy import Script, one_stage, pour, run, simulate, states
 from tests.support.toy_campaign import (
@@ -192,9 +192,11 @@ def test_one_question_is_asked_as_often_as_the_error_says(tmp_path: Path) -> Non
     device, events = Dying(), list[Event]()
     laboratory = ToyLaboratory(optimizer=optimizer.DeviceOptimizer(device))  # type: ignore[arg-type]
     with pytest.raises(
-        RequestExecutorError, match=r"asked the same question 3 times and failed each time \(DeviceLostError"
-    ):
+        RequestExecutorError, match=r"asked the same question 3 times and failed each time \(its process died\)"
+    ) as raised:
         run(tmp_path / "run", laboratory, subscribers=[events.append])
+    reasons = [event.reason for event in events if isinstance(event, CampaignStateChanged)]
+    assert reasons[-1] == str(raised.value)  # what the terminal prints: no name of a class before it
     assert (device.calls, device.revived) == (3, 3)
     told = [event.text for event in events if isinstance(event, LogLine) and "asked again" in event.text]
     assert [text[-15:] for text in told] == ["the second time", " the third time"]
