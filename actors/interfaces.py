@@ -46,7 +46,10 @@ class NotPouredError(LaboratoryError):
 
 
 class LinkLostError(NotPouredError):
-    """As stated, on a virtual bench: the connection to one of its devices was lost. A restarted bench can repeat it."""
+    """As stated, on a virtual bench, whose host was too slow for the arm's heartbeat, or which lost a connection.
+
+    A restarted bench can repeat it.
+    """
 
 
 class UnknownPourError(LaboratoryError):

@@ -73,8 +73,9 @@ class Pace:
         return self._interrupted.is_set()
 
 
-LONGEST_STAND = 20.0
-"""Wall time after which a clock that stands goes on [s]: its process or the one that it waits for hangs."""
+LONGEST_STAND = 300.0
+"""Wall time after which a clock that stands goes on [s]: its process or the one that it waits for hangs. On a busy host
+a process was given no processor for half a minute."""
 
 PATIENCE = 10.0
 """Factor of the wall-time limits of starting and answering processes on a virtual bench, whose host may be slow."""

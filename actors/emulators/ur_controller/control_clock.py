@@ -25,7 +25,7 @@ from actors.emulators.ur_controller.servers.dashboard_server import DashboardCon
 from actors.emulators.ur_controller.servers.primary_server import PrimaryConnection, PrimaryServer
 from actors.emulators.ur_controller.servers.robot_api_server import RobotApiConnection
 from actors.emulators.ur_controller.servers.rtde_server import RtdeConnection, RtdeServer
-from actors.runtime.bench_clock import SharedClock
+from actors.runtime.bench_clock import LONGEST_STAND, SharedClock
 
 SLOWEST_WAKE = 0.002
 """Shortest wall time between two wake-ups of the clock [s]; in scaled time, each wake-up runs several ticks."""
@@ -228,11 +228,7 @@ class Host:
             self.controller.tick()
 
 
-HUNG = 300.0
-"""Wall time after which a process with a blocked interpreter is ended [s]; a busy host may let it wait long."""
-
-
-async def until_orphaned(parent: int, interval: float = 0.5, hung: float = HUNG) -> None:
+async def until_orphaned(parent: int, interval: float = 0.5, hung: float = LONGEST_STAND) -> None:
     """Wait for the parent process to end: by the end of standard input, and by a change of the parent's id.
 
     The pipe alone is not enough, because a forked grandchild may hold its other end open. A blocked interpreter notices

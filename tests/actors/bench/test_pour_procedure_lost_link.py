@@ -9,6 +9,7 @@ from typing import Any
 import psutil
 import pytest
 
+from actors.arm.arm_interface import ArmStoppedError
 from actors.bench.ground_truth import GroundTruth
 from actors.interfaces import LinkLostError, NotPouredError
 from tests.support.waiting import PATIENCE
@@ -62,6 +63,23 @@ async def test_a_link_that_was_lost_when_the_tilt_was_asked_for_poured_nothing_i
     async with open_stage(wired_spec(hurried=True)) as stage:
         error = await cut(stage, "tilts", lambda stage: stage.site.fault("drop"))
         assert isinstance(error, LinkLostError), error
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize(("kind", "repeatable"), [("watchdog", True), ("protective stop", False)])
+async def test_a_pour_may_be_made_again_after_the_host_was_too_slow_for_the_heartbeat(
+    open_stage: Any, monkeypatch: pytest.MonkeyPatch, kind: str, repeatable: bool
+) -> None:
+    """Any other stop is looked into by a person, also on a virtual bench."""
+
+    async def stopped(*_: object) -> None:
+        raise ArmStoppedError("the heartbeat paused for 28.0 s", kind, "approach", 0.0, 0.0)
+
+    async with open_stage(wired_spec(hurried=True)) as stage:
+        monkeypatch.setattr(stage.bench.arm, "move_to_start", stopped)
+        with pytest.raises(NotPouredError, match=r"paused for 28\.0 s\. Nothing was poured") as raised:
+            await asyncio.wait_for(stage.pour(), PATIENCE)
+        assert isinstance(raised.value, LinkLostError) == repeatable
 
 
 def test_hardware_never_knows_that_nothing_flowed() -> None:
