@@ -80,6 +80,7 @@ class RunPour:
         time: when it began, or ended; None before (seconds since 1970).
         seconds: duration, operator and balance included; None if unknown.
         progress: last reported, while the run is followed.
+        attempts: how often it was begun.
     """
 
     stage: str
@@ -91,6 +92,7 @@ class RunPour:
     time: float | None = None
     seconds: float | None = None
     progress: PourProgress | None = None
+    attempts: int = 0
 
     @property
     def measured(self) -> PourMeasurement | None:
@@ -404,7 +406,7 @@ class RunState:
             case RequestStarted(request=Pour()):
                 stage.occupancy.pour_started(event.time)
                 self.pour = self._pour(event)
-                self.pour.state, self.pour.time = "under way", event.time
+                self.pour.state, self.pour.time, self.pour.attempts = "under way", event.time, event.attempt
             case PourWithdrawn():
                 self._pours[event.id].state, self._pours[event.id].time = "asked", event.time
             case RequestFinished(request=Pour()):

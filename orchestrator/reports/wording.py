@@ -399,7 +399,8 @@ def cost(record: RunState, occupancy: Mapping[str, PoolUse], time_scale: float |
     if begun:
         failed, unknown = sum(p.state == "failed" for p in begun), len(record.unknown_pours)
         lost = "".join(f", {n} {word}" for n, word in ((failed, "failed"), (unknown, "of unknown outcome")) if n)
-        costs["pours"] = f"{len(begun)} begun, {len(weighed)} weighed{lost}"
+        again = f" ({n} more than once)" if (n := sum(p.attempts > 1 for p in begun)) else ""
+        costs["pours"] = f"{len(begun)} begun{again}, {len(weighed)} weighed{lost}"
     if liquid := _liquid(record, weighed):
         costs["liquid"] = liquid
     costs["program at work"] = minutes(record.at_work_s)

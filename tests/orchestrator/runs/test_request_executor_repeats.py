@@ -13,7 +13,9 @@ from rich.console import Console
 from actors.interfaces import BenchLostError, LaboratoryError, LinkLostError, UnknownPourError
 from orchestrator.learning.requests import Poured
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.records.run_record import read_record
 from orchestrator.reports.console_progress import ProgressDisplay
+from orchestrator.reports.wording import cost
 from orchestrator.runs.request_executor import (
     Deadlines,
     PourNotMadeError,
@@ -67,6 +69,7 @@ def test_a_pour_is_made_again_with_one_line_if_the_link_was_lost_before_anything
         kinds = [Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED]
         entries = [(e.kind, e.body.get("attempt")) for e in journal.entries(kinds=kinds)][:3]
     assert entries == [(Kind.POUR_STARTED, 1), (Kind.POUR_WITHDRAWN, None), (Kind.POUR_STARTED, 2)]
+    assert cost(read_record(tmp_path), {})["pours"] == "2 begun (1 more than once), 2 weighed"  # in the report
 
 
 def test_an_unknown_pour_is_repeated_without_ending_the_run_if_the_campaign_says_so(tmp_path: Path) -> None:
