@@ -187,7 +187,7 @@ def judge(
         findings: values of the controller.
         record: the accepted safety settings; None if there are none.
         accept: the command that accepts them.
-        virtual: whether the arm is virtual and needs no acceptance.
+        virtual: whether the arm is virtual: it needs no acceptance, and no fast connection.
     """
     checks = _connection(spec, findings)
     if findings.software:
@@ -222,7 +222,7 @@ def judge(
     if findings.exchange is not None:
         exchange = findings.exchange
         payload = payload_check(spec, exchange.payload, exchange.payload_centre)
-        checks += [payload, _unless_blocked(_motion(exchange), checks), _network(exchange)]
+        checks += [payload, _unless_blocked(_motion(exchange), checks), _network(exchange, virtual=virtual)]
     return checks
 
 
@@ -436,12 +436,15 @@ def _motion(exchange: Exchange) -> DeviceCheck:
     return DeviceCheck("motion", "fail", why, "fix that first: no motion begins before")
 
 
-def _network(exchange: Exchange) -> DeviceCheck:
+def _network(exchange: Exchange, *, virtual: bool) -> DeviceCheck:
     text = (
         f"{1e3 * exchange.round_trip:.1f} ms there and back (slowest {1e3 * exchange.slowest:.1f} ms), "
         f"{exchange.rate:.0f} of {exchange.wanted:.0f} packages a second, longest gap {1e3 * exchange.gap:.0f} ms"
     )
-    if exchange.gap >= LONGEST_GAP or exchange.rate < 0.8 * exchange.wanted:
+    poor = exchange.gap >= LONGEST_GAP or exchange.rate < 0.8 * exchange.wanted
+    if poor and virtual:
+        return DeviceCheck("connection", "warn", text, "this computer is busy; a virtual bench waits for it")
+    if poor:
         return DeviceCheck(
             "connection", "fail", text, "connect by cable, without wireless or VPN; is this computer overloaded?"
         )

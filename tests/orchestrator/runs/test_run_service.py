@@ -285,6 +285,7 @@ def test_a_stopped_run_is_published_as_far_as_it_came(tmp_path: Path) -> None:
     assert "paused" in published.report.read_text(encoding="utf-8")
 
 
+@pytest.mark.timeout(900)  # three recordings: half a minute on an idle machine
 def test_the_service_the_command_line_and_the_library_make_the_same_decisions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -121,8 +122,10 @@ def test_an_arm_stopped_on_its_way_to_the_pour_goes_back_the_way_it_came(rig: Ri
 
 @pytest.mark.realtime
 @pytest.mark.parametrize("phase", ["tilt", *(pytest.param(p, marks=pytest.mark.slow) for p in ("hold", "return"))])
-def test_a_protective_stop_holds_the_tilted_pourer_until_an_operator_has_looked(make_rig: Make, phase: str) -> None:
-    rig = make_rig(LONG_HOLD)
+def test_a_protective_stop_holds_the_tilted_pourer_until_an_operator_has_looked(
+    make_rig: Make, tmp_path: Path, phase: str
+) -> None:
+    rig = make_rig(LONG_HOLD, clock=str(tmp_path / "clock"))
     if phase == "tilt":
         rig.fault("protective_stop", joint=5, above=START[5] + 0.6)
     pouring = rig.pouring()
