@@ -193,8 +193,8 @@ class RayDevice:
         except ray.exceptions.RayActorError as error:
             self._lost = True
             await self._check_machine(method)
-            if error.actor_init_failed:  # its text is a traceback, which ends with 'module.Error: why'
-                reason = re.sub(r"^[\w.]+Error: ", "", last_lines(str(error), 1))
+            if error.actor_init_failed:  # its text is a traceback, whose end has our errors as 'module.Error: why'
+                reason = re.sub(r"^[\w.]+\.\w+Error: ", "", last_lines(str(error), 1))
                 raise DeviceLostError(f"{self.name}: did not start: {reason}") from error
             raise DeviceLostError(f"{self.name}: its process died during '{method}'") from error
         except ray.exceptions.RayTaskError as error:

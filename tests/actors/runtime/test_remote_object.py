@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import re
 import sys
 import threading
 from pathlib import Path
@@ -104,21 +105,26 @@ async def test_a_process_that_never_starts_is_lost(
 class Broken:
     """Its constructor fails."""
 
-    def __init__(self) -> None:
-        raise LaboratoryError("virtual controller at 127.0.0.2: not ready")
+    def __init__(self, error: Exception) -> None:
+        raise error
 
     def value(self) -> int:
         return 5
 
 
 @pytest.mark.ray
-async def test_a_process_that_does_not_start_says_why(ray_running: None) -> None:
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (LaboratoryError("virtual controller at 127.0.0.2: not ready"), "virtual controller at 127.0.0.2: not ready"),
+        (KeyError("mass"), "KeyError: 'mass'"),  # of a defect, the type says more than the text
+    ],
+)
+async def test_a_process_that_does_not_start_says_why(ray_running: None, error: Exception, reason: str) -> None:
     import ray
 
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers can't import test modules
-    bench = RayDevice("emulators", Broken)
-    with pytest.raises(
-        DeviceLostError, match=r"^emulators: did not start: virtual controller at 127\.0\.0\.2: not ready$"
-    ):
+    bench = RayDevice("emulators", Broken, error)
+    with pytest.raises(DeviceLostError, match=f"^emulators: did not start: {re.escape(reason)}$"):
         await bench.call("value", deadline=60.0)
     await bench.close()
