@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from actors.arm.arm_interface import ArmLostError, ArmNotReleasedError, ArmRefusedError, ArmStoppedError
+from actors.arm.ur.motion_execution import MotionMonitor
+from actors.arm.ur.rtde_client import RtdeClient
+from actors.runtime.bench_clock import SharedClock
 from tests.actors.arm.ur.conftest import Call, Rig
 from tests.support.ur_pours import HOME, START, pour_path
 
@@ -162,3 +168,43 @@ def _upload(rig: Rig, statements: str) -> None:
     with socket.create_connection((rig.controller.address, 30003), timeout=5) as connection:
         connection.sendall(f"def other():\n {statements}\nend\n".encode())
         rig.await_that(lambda: "program other started" in str(rig.fault("state")["messages"]), "start of the program")
+
+
+@pytest.mark.realtime
+def test_a_motion_begins_after_the_worker_was_late_and_the_clock_stood(
+    make_rig: Make, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The worker waited for a newer package then, and the clock for the worker: 300 s, on a busy host only."""
+    rig = make_rig(clock=str(tmp_path / "clock"))
+    orders: list[Any] = []
+    ask = rig.arm._session.ask
+
+    def kept(method: str, *arguments: Any, **options: Any) -> Any:
+        if method == "run":
+            orders.append(arguments[0])
+            raise ArmRefusedError("kept for the test")
+        return ask(method, *arguments, **options)
+
+    monkeypatch.setattr(rig.arm._session, "ask", kept)
+    rig.arm.release()
+    with pytest.raises(ArmRefusedError, match="kept"):
+        rig.arm.move_to_start(rig.path)
+    rig.arm.close()  # frees the inputs that its worker wrote
+
+    clock = SharedClock(tmp_path / "clock")
+    spec = rig.arm._spec
+    client = RtdeClient(rig.controller.address, spec.rate, 10.0, spec.registers, clock)
+    monitor = MotionMonitor(client, rig.controller.address, orders[0], lambda _: None, lambda: clock.now)
+    ready = monitor._until_ready
+
+    def late(primary: Any) -> str:
+        refusal = ready(primary)
+        before = clock.now - 1.0
+        while clock.now != before:
+            before = clock.now
+            time.sleep(0.2)  # longer than a clock that goes on stands still
+        return refusal
+
+    monkeypatch.setattr(monitor, "_until_ready", late)
+    outcome = Call(monitor.run).result()
+    assert outcome.kind == "completed", outcome.text
