@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from actors.arm.arm_device import DeviceArm
-from actors.arm.arm_interface import PlannedPour
+from actors.arm.arm_interface import ArmFacts, PlannedPour
 from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.arm.pour_feasibility import path_of
 from actors.arm.simulated_arm import SimulatedArmSettings
@@ -29,7 +29,7 @@ from actors.bench.ground_truth import GroundTruth
 from actors.bench.held_vessel import HeldVessel, HoldingArm
 from actors.bench.liquid_supply import LiquidSupply, PumpDevice, SpillWatch
 from actors.bench.night_consent import NightConsent
-from actors.bench.pour_procedure import BenchProcedure, PourProcedure
+from actors.bench.pour_procedure import BenchProcedure, PourProcedure, is_of_host
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
 from actors.bench.vessel_carrying import VesselCarrier
 from actors.bench.vessel_handling import VesselHandling
@@ -40,7 +40,9 @@ from actors.interfaces import (
     DoseTarget,
     InvalidActionError,
     LaboratoryError,
+    LinkLostError,
     Notice,
+    NotPouredError,
     Operator,
     OperatorQuestion,
     ProgressCallback,
@@ -89,7 +91,7 @@ class PouringBench:
 
         Raises:
             InvalidActionError: the pour was rejected before any motion and before any question.
-            NotPouredError: the pour did not begin.
+            NotPouredError: the pour did not begin; `LinkLostError` if a virtual bench may make it again.
             UnknownPourError: the pour began, but did not run as planned.
         """
         async with self._one_at_a_time:
@@ -97,8 +99,7 @@ class PouringBench:
                 simulated = await self.ground_truth.simulated_dose(scene, dose, seed, self._dosing, progress)
                 if simulated is not None:
                     return simulated
-            with contextlib.suppress(LaboratoryError):  # the procedure reports why the arm is not ready
-                self._arm_spec = self._arm_spec.fitted_to(await self.arm.ready())
+            self._arm_spec = self._arm_spec.fitted_to(await self._connected())
             path = await asyncio.to_thread(self._checked, scene, action)
             if self._setup.doses is not None and dose is not None:
                 await asyncio.to_thread(self._setup.doses.fit, self._arm_spec, scene, dose, path)
@@ -109,6 +110,24 @@ class PouringBench:
                 return await self._run(scene, action, path, seed, progress, dose)
 
             return await (run() if self._watch is None else self._watch.watched(run, self.arm.hands_in))
+
+    async def _connected(self) -> ArmFacts:
+        """Connect the arm: a path planned without the robot's calibration is refused by the arm.
+
+        A lost connection may return at once, so there are two attempts.
+
+        Raises:
+            NotPouredError: the arm cannot be connected; `LinkLostError` if a virtual bench may make the pour again.
+        """
+        with contextlib.suppress(LaboratoryError):
+            return await self.arm.ready()
+        try:
+            return await self.arm.ready()
+        except LaboratoryError as error:
+            if self._setup.night is not None:
+                self._setup.night.end(str(error))
+            lost = self.mode == "virtual" and is_of_host(error)
+            raise (LinkLostError if lost else NotPouredError)(f"{error}. Nothing was poured") from error
 
     async def _run(
         self,

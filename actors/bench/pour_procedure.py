@@ -265,7 +265,7 @@ class BenchProcedure(ABC):
             text = f"{error}. {await self._unknown(error) if self._begun else 'Nothing was poured'}"
             untouched = not self._begun or await setup.ground_truth.untouched()
             await self._consent.leave_safe()
-            if setup.mode == "virtual" and untouched and _is_of_host(error):
+            if setup.mode == "virtual" and untouched and is_of_host(error):
                 self._withdraw()
                 raise LinkLostError(text) from error
             raise (UnknownPourError if self._begun else NotPouredError)(text) from error
@@ -317,7 +317,7 @@ BEFORE_TILT = 1.0
 """Readings are recorded from so long before the first tilt on [s]."""
 
 
-def _is_of_host(error: BaseException | None) -> bool:
+def is_of_host(error: BaseException | None) -> bool:
     """Whether an error or its cause is a lost connection or a heartbeat that paused: a virtual bench's host is slow."""
     while error is not None:
         if isinstance(error, ArmLostError | DeviceLostError | NoConnectionError):

@@ -9,7 +9,7 @@ from typing import Any
 import psutil
 import pytest
 
-from actors.arm.arm_interface import ArmStoppedError
+from actors.arm.arm_interface import ArmLostError, ArmStoppedError
 from actors.bench.ground_truth import GroundTruth
 from actors.interfaces import LinkLostError, NotPouredError
 from tests.support.waiting import PATIENCE
@@ -80,6 +80,28 @@ async def test_a_pour_may_be_made_again_after_the_host_was_too_slow_for_the_hear
         with pytest.raises(NotPouredError, match=r"paused for 28\.0 s\. Nothing was poured") as raised:
             await asyncio.wait_for(stage.pour(), PATIENCE)
         assert isinstance(raised.value, LinkLostError) == repeatable
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("losses", [1, 2])
+async def test_a_pour_is_planned_with_the_calibration_of_a_robot_that_was_connected_at_the_second_attempt(
+    open_stage: Any, monkeypatch: pytest.MonkeyPatch, losses: int
+) -> None:
+    """It was planned with nominal lengths after the first one failed, and the arm refused it."""
+    async with open_stage(wired_spec(hurried=True)) as stage:
+        connect, left = stage.bench.arm.ready, iter(range(losses))
+
+        async def ready() -> Any:
+            for _ in left:
+                raise ArmLostError("the arm's worker did not answer")
+            return await connect()
+
+        monkeypatch.setattr(stage.bench.arm, "ready", ready)
+        if losses > 1:
+            with pytest.raises(LinkLostError, match=r"did not answer\. Nothing was poured"):
+                await asyncio.wait_for(stage.pour(), PATIENCE)
+        measured = await asyncio.wait_for(stage.pour(), PATIENCE)
+        assert measured.spilled > 0.0
 
 
 def test_hardware_never_knows_that_nothing_flowed() -> None:
