@@ -7,9 +7,11 @@
 - `night`: mixtures.yaml on rack.yaml, where an arm carries the vessels of six cups.
 - `series`: the doses of dispense.yaml on virtual-dosing.yaml, in real time.
 
-The busy processes have normal priority, run on the same cores, and end with this process. `--one-core` keeps
-everything on the first permitted core. Each run's exit code and time are printed; the time is not judged. The exit
-code is 1 if a run ended with another code than 0; the folder of such a run is kept.
+The busy processes have normal priority, run on the same cores, and end with this process. Where Linux divides the
+processor among sessions (`sched_autogroup_enabled`), each of them gets as much of it as all simulators of a run
+together, and as an emulated device; each line says so. `--one-core` keeps everything on the first permitted core. Each
+run's exit code and time are printed; the time is not judged. The exit code is 1 if a run ended with another code than
+0; the folder of such a run is kept.
 """
 
 from __future__ import annotations
@@ -51,6 +53,12 @@ def busy_processes(count: int) -> Iterator[None]:
         for child in children:
             child.kill()
             child.wait()
+
+
+def divided_among() -> str:
+    """What Linux divides the processor among: processes, or sessions."""
+    setting = Path("/proc/sys/kernel/sched_autogroup_enabled")
+    return "sessions" if setting.exists() and setting.read_text().strip() == "1" else "processes"
 
 
 @dataclass
@@ -116,7 +124,8 @@ def main() -> int:
                 failures, count = failures + (status != 0), count + 1
                 say(
                     f"{count}/{total}: {run.name} with seed {run.seed}: exit {status} after {seconds:.0f} s "
-                    f"({chosen.busy} busy, {chosen.at_once} at once, {cores} cores, load {os.getloadavg()[0]:.0f})"
+                    f"({chosen.busy} busy, {chosen.at_once} at once, {cores} cores divided among {divided_among()}, "
+                    f"load {os.getloadavg()[0]:.0f})"
                     f"{f': {text}' if status else ''}"
                 )
     return 1 if failures else 0
