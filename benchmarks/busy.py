@@ -7,11 +7,11 @@
 - `night`: mixtures.yaml on rack.yaml, where an arm carries the vessels of six cups.
 - `series`: the doses of dispense.yaml on virtual-dosing.yaml, in real time.
 
-The busy processes have normal priority, run on the same cores, and end with this process. Where Linux divides the
-processor among sessions (`sched_autogroup_enabled`), each of them gets as much of it as all simulators of a run
-together, and as an emulated device; each line says so. `--one-core` keeps everything on the first permitted core. Each
-run's exit code and time are printed; the time is not judged. The exit code is 1 if a run ended with another code than
-0; the folder of such a run is kept.
+The busy processes have normal priority, run on the same cores, and end with this process. Linux may divide the
+processor among sessions (`sched_autogroup_enabled`); one busy process then gets as much as one emulated device, or as
+all simulators of a run together. Each line says how it is divided. `--one-core` keeps everything on the first permitted
+core. Each run's exit code and time are printed; the time is not judged. The exit code is 1 if a run ended with another
+code than 0; the folder of such a run is kept.
 """
 
 from __future__ import annotations
