@@ -423,7 +423,7 @@ def test_the_cup_is_upright_within_a_second_after_the_program_was_killed() -> No
         client = subprocess.Popen(
             [sys.executable, "-c", CLIENT, arm.address], stdout=subprocess.PIPE, text=True, env=child_environment()
         )
-        patience = threading.Timer(0.2 * PATIENCE, client.kill)  # then it says nothing any more
+        patience = threading.Timer(0.8 * PATIENCE, client.kill)  # then it says nothing any more
         patience.start()
         try:
             assert client.stdout is not None
