@@ -8,7 +8,7 @@ The bench, its balance and its arm are those of benchmarks/dosing.py; cup, recei
 log-uniform, from a source that is 40 to 90 % full and is filled again when it holds too little. The receiver stands
 where the row's placement says; the grip's error is drawn as on the formula's bench. A source that is no straight cup
 begins with what a simulated dose has shown, as in a run. Development used the seeds below 8000; final ones are used
-once, and those up to 8021 are used up. A source filled to the brim has 8,000 particles: with 4,000, half of which are
+once, and those up to 8023 are used up. A source filled to the brim has 8,000 particles: with 4,000, half of which are
 mirror images, a fine flow of 8 g/s is some thirty pairs of particles a second, and their number alone scatters.
 
 The run may be interrupted: `--into FILE` appends each finished series to a file as a line of JSON, and the next run
