@@ -5,7 +5,8 @@
 
 - `quickstart`: the README's campaign.
 - `night`: mixtures.yaml on rack.yaml, where an arm carries the vessels of six cups.
-- `series`: the doses of dispense.yaml on virtual-dosing.yaml, in real time.
+- `series`: the doses of dispense.yaml on virtual-dosing.yaml, of particles; a dose that misses its tolerance makes it
+  end with 4.
 
 The busy processes have normal priority, run on the same cores, and end with this process. Linux may divide the
 processor among sessions (`sched_autogroup_enabled`); one busy process then gets as much as one emulated device, or as

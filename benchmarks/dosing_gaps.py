@@ -269,8 +269,10 @@ def over_the_wires(count: int, seed: int = 3) -> list[dict[str, Any]]:
     )
     laboratory: LaboratorySettings = plan.laboratory
     assert laboratory.arm is not None
+    assert laboratory.bench is not None
     laboratory = laboratory.with_values(
         in_process=True,
+        bench=laboratory.bench.with_values(doses="formula"),
         arm=laboratory.arm.with_values(warning_time=0.2),
         operator=laboratory.operator.with_values(time=1.0),
     )

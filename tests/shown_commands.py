@@ -98,6 +98,7 @@ def write_scratch(folder: Path) -> str:
     shutil.copytree(ROOT / "configs", folder / "configs")
     _change(folder / "configs/laboratories/twin.yaml", _small_laboratory)
     _change(folder / "configs/laboratories/planning.yaml", lambda lab: lab.update(in_process=True))
+    _change(folder / "configs/laboratories/virtual-dosing.yaml", lambda lab: lab["bench"].update(doses="formula"))
     _change(folder / "configs/campaigns/quickstart.yaml", _small_quickstart)
     _change(folder / "configs/campaigns/recorded.yaml", _small_recorded)
     for table in (folder / "configs/data").glob("*/*.csv"):

@@ -5,10 +5,10 @@ python -m tests.reliability.mixture_night --seed 22 --faults 6    # one fault in
 python -m tests.reliability.mixture_night --write 21 22 23        # no dose: the table of docs/evidence/dosing.md
 
 The campaign is run, stopped and resumed as `decant run` does it: 24 cups on the rack of `rack.yaml`, each with water,
-70 % ethanol (by mass) and rapeseed oil, 72 doses of 2.5 to 60 g, two sources for each liquid. Doses of 2 g are refused
-for this source and balance (2.1 to 2.4 g are supported). Arm, gripper and balance are behind their protocols; the
-liquid of a dose follows the executed motion. After a fault a person removes the cause, and the run goes on with a new
-consent; vessels keep what they truly hold from one run to the next.
+70 % ethanol (by mass) and rapeseed oil, 72 doses of 2.5 to 60 g by the formula, two sources for each
+liquid. Doses of 2 g are refused for this source and balance (2.1 to 2.4 g are supported). Arm, gripper and balance
+are behind their protocols; the liquid of a dose follows the executed motion. After a fault a person removes the
+cause, and the run goes on with a new consent; vessels keep what they truly hold from one run to the next.
 
 Questions, as they stood before the first counted night:
 
@@ -156,6 +156,7 @@ def write_campaign(folder: Path, cups: int, seed: int, liquids: Sequence[str] = 
     ]
     laboratory["places"] = [others[0], *sources, *others[1:]]
     laboratory["name"] = "rack"
+    laboratory["bench"]["doses"] = "formula"
     yaml.dump(laboratory, folder / "rack.yaml")
     campaign = yaml.load(ROOT / "configs" / "campaigns" / "mixtures.yaml")
     mixtures, seventy = campaign["mixtures"], {"density": "868 kg/m^3", "viscosity": "2.21 mPa*s"}

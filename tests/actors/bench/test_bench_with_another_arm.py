@@ -39,6 +39,7 @@ def laboratory(folder: Path, name: str = "virtual-dosing", **sections: object) -
     """A shipped virtual laboratory with the other arm in the place of its UR."""
     settings = yaml.safe_load((LABORATORIES / f"{name}.yaml").read_text())
     settings["arm"] |= {"kind": "other", "warning_time": "0.2 s", "approach_speed": "90 deg/s"}
+    settings["bench"].pop("doses", None)
     del settings["arm"]["model"]
     path = folder / "other.yaml"
     path.write_text(yaml.safe_dump({**settings, **sections}))

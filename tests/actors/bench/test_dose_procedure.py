@@ -81,7 +81,7 @@ def dosing_spec(dialect: str = "kcp", pace: float = PACE, **balance: Any) -> Lab
         in_process=True,
         arm=spec.arm.with_values(time_scale=pace, warning_time=0.2, approach_speed=90 * DEG),
         balance=spec.balance.with_values(dialect=dialect, time_scale=pace, reconnect_time=1.0, **balance),
-        bench=spec.bench.with_values(time_scale=pace),
+        bench=spec.bench.with_values(doses="formula", time_scale=pace),
         operator=spec.operator.with_values(time=1.0),
     )
 
