@@ -233,7 +233,7 @@ def _forces(forces: FloatArray) -> dict[str, Any]:
 
 
 def unpack(data: dict[str, Any]) -> ExecutedPath:
-    """Inverse of `pack`.
+    """Inverse of `pack`. Of equal times, which records of version 0.3.0 and earlier may begin with, the first is kept.
 
     Raises:
         ValueError: `pack` did not make these values.
@@ -242,6 +242,7 @@ def unpack(data: dict[str, Any]) -> ExecutedPath:
         raw = zlib.decompress(base64.b85decode(data["packed"]))
         steps = np.frombuffer(raw, "<i4").reshape(-1, int(data["samples"])).T if raw else np.zeros((0, 7), "<i4")
         integers = np.cumsum(steps, axis=0)
+        integers = integers[np.diff(integers[:, 0], prepend=-1) > 0]
         times, joints = integers[:, 0].astype(float) * TIME_UNIT, integers[:, 1:].astype(float) * JOINT_UNIT
         return ExecutedPath(times, joints, bool(data["completed"]), dict(data["tracking"]))
     except (KeyError, TypeError, ValueError, zlib.error) as error:
