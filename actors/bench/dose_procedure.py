@@ -359,8 +359,13 @@ class DoseProcedure(BenchProcedure):
                 await self._sleep(max(now + TICK - self._now(), 0.0))
                 if self._now() - now > 1.5 * TICK:  # this process paused, and the arm moved on
                     state = await arm.state()
+            while not motion.done():  # without commands the cup turns back, and the program ends
+                state = await arm.state()
+                self._tilts.append((self._now() - begin, (state.tilt or 0.0) - upright))
+                clock.promise("dose", LATEST_COMMAND)
+                await self._sleep(TICK)
             clock.withdraw("dose")
-            self._executed = await motion  # without commands the cup turns back, and the program ends
+            self._executed = await motion
         finally:
             clock.withdraw("dose")
             if not motion.done():
@@ -404,15 +409,15 @@ class DoseProcedure(BenchProcedure):
         assert self._series is not None
         assert result.amount is not None
         source = source_of(self._scene, self._dose)
-        every = max(len(self._tilts) // SIGNALS, 1)
         during = [r for r in self._readings.all if r.time >= self._at]
+        tilts = self._tilts[:: max(len(self._tilts) // SIGNALS, 1)]
         about = {
             **after_dose(self._series, result),
             "wanted": self._dose.amount,
             "spilled": None,  # nothing outside the receiver is weighed
             "duration": self._duration,
-            "times": [round(t, 3) for t, _ in self._tilts[::every]],
-            "tilt_deg": [round(math.degrees(tilt), 2) for _, tilt in self._tilts[::every]],
+            "times": [round(t, 3) for t, _ in tilts],
+            "tilt_deg": [round(math.degrees(tilt), 2) for _, tilt in tilts],
             "read_at": [round(r.time - self._at, 3) for r in during],
             "readings_g": [round(1e3 * (r.mass - self._zero), 3) for r in during],
             "placed_at": [round(r.time - self._at, 3) for r in self._placed],

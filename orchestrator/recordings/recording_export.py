@@ -87,9 +87,10 @@ def _export(path: Path, pour: RunPour, scene: Scene, plan: CampaignPlan, run: st
     balance = {"model": _balance(plan), **({"step": f"{signals['step_g']:g} g"} if signals.get("step_g") else {})}
     if signals.get("times") and signals.get("read_at"):
         tilt: Pairs = list(zip(signals["times"], signals["tilt_deg"], strict=True))
+        end = signals.get("duration") or math.inf  # an arm may take the receiver of a dose away then
         mass = [
             *zip(signals.get("placed_at", ()), signals.get("placed_g", ()), strict=True),
-            *zip(signals["read_at"], signals["readings_g"], strict=True),
+            *(pair for pair in zip(signals["read_at"], signals["readings_g"], strict=True) if pair[0] <= end),
         ]
         how = "tilt and readings as they arrived, on one clock"
         if dose:
@@ -106,7 +107,7 @@ def _export(path: Path, pour: RunPour, scene: Scene, plan: CampaignPlan, run: st
     return write_recording(
         path,
         Scene(path.stem, scene.pourer, scene.receiver, liquid),
-        {"tilt_deg": tilt, "mass_g": _once(mass)},
+        {"tilt_deg": _once(tilt), "mass_g": _once(mass)},
         recorded={"how": f"{how} ({notes.get('mode', 'virtual')})", "run": f"{run}, {pour.stage} {request.number}"},
         placement={name: f"{1e3 * value:.6g} mm" for name, value in lengths.items() if value},
         balance=balance,

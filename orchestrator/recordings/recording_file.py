@@ -303,7 +303,7 @@ def _checked(path: Path, section: RecordingFile, scene: Scene, series: TimeSerie
         ("mass", poured, "nothing is filled in, and the estimate runs on without a reading"),
     ):
         missing = gaps(column, LONGEST_GAP)
-        if missing:
+        if missing and len(column) > 2:  # two readings are those before and after a pour
             i = max(missing, key=lambda i: float(column.times[i] - column.times[i - 1]))
             width = column.times[i] - column.times[i - 1]
             others = "" if len(missing) == 1 else f"; there are {len(missing)} gaps above {LONGEST_GAP:g} s"

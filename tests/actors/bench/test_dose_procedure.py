@@ -105,6 +105,7 @@ def check_amount(stage: Stage, measured: PourMeasurement, grams: float, held: fl
     assert received == pytest.approx(1e3 * stage.contents.in_receiver, abs=0.5)
     assert max(about["tilt_deg"]) > 40.0
     assert len(about["readings_g"]) > 20
+    assert np.diff(about["times"]).max() < 1.0, "also while the cup turns back"
     assert about["left"][0] == pytest.approx(held - about["received"], abs=5e-3)
 
 

@@ -121,7 +121,9 @@ def test_the_gain_of_two_weights_is_the_second(tmp_path: Path) -> None:
     scene = load_recordings([SAMPLES])[0].scene
     columns = {"tilt_deg": [(0.0, 0.0), (1.0, 60.0), (2.0, 0.0)], "mass_g": [(0.0, 0.0), (2.0, 69.09)]}
     path = write_recording(tmp_path / "pour.yaml", scene, columns, recorded={"how": "weighed"}, balance={"zero": "0 g"})
-    assert load_recordings([path])[0].gain == pytest.approx(0.06909)
+    (recording,) = load_recordings([path])
+    assert recording.gain == pytest.approx(0.06909)
+    assert not recording.warnings, "nothing is missing between the two"
 
 
 def test_recordings_of_two_pourers_are_no_day(tmp_path: Path) -> None:

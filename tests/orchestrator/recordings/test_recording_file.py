@@ -476,6 +476,7 @@ async def test_a_run_records_its_doses_and_they_can_be_exported_again(
     assert [1e3 * one.scene.liquid.mass for one in doses] == pytest.approx([100.0, 73.0], abs=3.0)
     assert all(len(one.placed) > 20 and one.origin.run and one.scene.pourer.name == "beaker" for one in doses)
     assert not any(one.warnings for one in doses)
+    assert all(one.read_times[-1] <= one.tilt_times[-1] for one in doses), "the receiver may have been taken away"
     again, left_out = export_recordings(run, tmp_path / "again")
     assert (len(again), left_out) == (2, [])
     assert load_recording(again[0]).net == pytest.approx(doses[0].net)
