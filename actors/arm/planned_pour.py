@@ -233,7 +233,7 @@ def _forces(forces: FloatArray) -> dict[str, Any]:
 
 
 def unpack(data: dict[str, Any]) -> ExecutedPath:
-    """Inverse of `pack`. Of equal times, which records of version 0.3.0 and earlier may begin with, the first is kept.
+    """Inverse of `pack`. Of readings that are nearer than `TIME_UNIT` and have equal times there, the first is kept.
 
     Raises:
         ValueError: `pack` did not make these values.

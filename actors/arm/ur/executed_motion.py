@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from actors.arm.arm_interface import FULL_SPEED
-from actors.arm.planned_pour import TIME_UNIT, ExecutedPath, FloatArray, JointPath
+from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath
 from actors.arm.planning.kinematics import cell_transforms, pourer_motion
 from actors.arm.ur.ur_kinematics import forward
 from actors.arm.ur.worker_messages import ForceSample, MotionOutcome, Sample
@@ -62,7 +62,6 @@ def executed_path(
         return ExecutedPath(np.zeros(0), np.zeros((0, 6)), False, {})
     slowed, offsets = slider < FULL_SPEED, stamps[running] - clocks[running]
     times = stamps - float(offsets.min() if slowed else np.median(offsets))
-    times = np.round(times / TIME_UNIT) * TIME_UNIT  # a record has no finer ones: 0 and 1e-12 s would be equal in it
     first = max(int(np.searchsorted(times, 0.0, side="right")) - 1, 0)
     times, joints, clocks = times[first:], joints[first:], clocks[first:]
     times[0] = max(times[0], 0.0) if len(times) > 1 else 0.0
